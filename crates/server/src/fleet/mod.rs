@@ -1,6 +1,7 @@
 //! Owns what is known of robots in memory only; it never stores anything and never decides what a
 //! robot should run.
 
+pub mod live_nodes;
 pub mod part_requests;
 pub mod presence;
 pub mod requests;

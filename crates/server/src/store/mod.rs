@@ -7,6 +7,7 @@
 
 #![expect(clippy::disallowed_methods, reason = "SQL is at home here")]
 
+mod cluster;
 mod database;
 mod deliveries;
 mod feed;
@@ -26,6 +27,10 @@ use std::sync::Arc;
 use sqlx::Connection as _;
 use task_proto::RobotId;
 
+pub use cluster::nodes::{NewNode, Node, NodeLoad};
+pub use cluster::robot_sessions::{
+    LeftSession, NewRobotSession, RobotSession, SessionNode, SessionPosition,
+};
 pub use database::connections::with_shared_reads;
 use database::connections::{ConnectionPool, PooledConnection, Statement};
 pub use database::copy::{CopyError, copy_database};
@@ -37,7 +42,7 @@ use database::integrity::{Checked, check_quickly, postgres_page_protection};
 use database::primary::NewConnection;
 pub use database::probe::check_postgres;
 use database::probe::probe;
-use database::sessions::{first_connection, make_file, pool_options};
+use database::sessions::{cluster_pool_options, first_connection, make_file, pool_options};
 pub use database::state::DatabaseState;
 use database::write_locks::{POSTGRES_LOCKS, SQLITE_LOCKS, WriteLocks};
 pub use deliveries::{DeliveryRequest, RobotDecision, RobotFacts};
@@ -93,6 +98,9 @@ const WITHOUT_SHARED_MEMORY: &str = "vfs=unix-excl";
 pub struct Store {
     reads: ConnectionPool,
     writes: ConnectionPool,
+    /// Writes of the cluster's own tables, which wait for no order. No connection is open unless
+    /// the server is in a cluster.
+    cluster_writes: ConnectionPool,
     auth_cache: AuthCache,
     first_uses: FirstUses,
     self_service_limit: Arc<KeyedRateLimit>,
@@ -375,6 +383,7 @@ impl Store {
                 &reader_cache,
                 &state,
             )),
+            cluster_writes: ConnectionPool::new(cluster_pool_options(url, &state)),
             auth_cache: AuthCache::default(),
             first_uses: FirstUses::default(),
             self_service_limit: Arc::new(new_self_service_limit()),
@@ -462,6 +471,7 @@ impl Store {
     /// Closes all connections after the writes that are under way, and frees the database's lock.
     pub async fn close(&self) {
         self.writes.close().await;
+        self.cluster_writes.close().await;
         self.reads.close().await;
         if let Some(guard) = &self.guard {
             guard.release().await;

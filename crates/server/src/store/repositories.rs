@@ -80,4 +80,8 @@ repositories! {
     publishers: Publishers;
     /// The newest entries of the feed.
     feed: Feed;
+    /// The servers that share the database.
+    nodes: Nodes;
+    /// The last session of each robot at any of them.
+    robot_sessions: RobotSessions;
 }

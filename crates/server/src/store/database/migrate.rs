@@ -35,6 +35,7 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[
     (21, "replaced", include_str!("../migrations/0021_replaced.sql")),
     (22, "guard", include_str!("../migrations/0022_guard.sql")),
     (23, "pages", include_str!("../migrations/0023_pages.sql")),
+    (24, "cluster", include_str!("../migrations/0024_cluster.sql")),
     (25, "blob_store", include_str!("../migrations/0025_blob_store.sql")),
 ];
 

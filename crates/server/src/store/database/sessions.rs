@@ -59,6 +59,12 @@ pub(in crate::store) const POSTGRES_SESSION: &str =
 /// Makes Postgres end a statement before the server gives up waiting for its answer.
 const POSTGRES_STATEMENT: &str = "SET statement_timeout = '50s';";
 
+/// Makes commits answer before they are on disk.
+const POSTGRES_ASYNCHRONOUS: &str = "SET synchronous_commit = off;";
+/// Time limit for the answer to a statement on the cluster's own tables. Other servers count this
+/// one as lost soon after.
+const CLUSTER_ANSWER_TIMEOUT: Duration = Duration::from_secs(8);
+
 /// The settings of a store's connections.
 pub(in crate::store) fn pool_options(
     url: &str,
@@ -89,5 +95,19 @@ pub(in crate::store) fn pool_options(
         connect_timeout: CONNECT_TIMEOUT,
         acquire_timeout: POSTGRES_CONNECTION_WAIT,
         ..of_file
+    }
+}
+
+/// The settings of the connection for the cluster's own tables. A crash of the database may lose
+/// the last of these writes; the server then writes them again.
+pub(in crate::store) fn cluster_pool_options(url: &str, state: &DatabaseState) -> PoolOptions {
+    let options = pool_options(url, 1, 1, "", state);
+    if !is_postgres(url) {
+        return options;
+    }
+    PoolOptions {
+        session: [&options.session, POSTGRES_ASYNCHRONOUS].concat(),
+        answer_timeout: CLUSTER_ANSWER_TIMEOUT,
+        ..options
     }
 }

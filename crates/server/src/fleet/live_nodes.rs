@@ -1,0 +1,146 @@
+//! The servers of the cluster that live, as this one sees them: those whose beat moves, by this
+//! server's own clock. A server alone is its only node. This module never asks the database.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+/// The longest rest of a beat before its server counts as dead.
+const MAX_REST: Duration = Duration::from_secs(10);
+
+/// The live servers. Clones share them.
+#[derive(Debug, Clone, Default)]
+pub struct LiveNodes {
+    known: Arc<Mutex<KnownNodes>>,
+}
+
+#[derive(Debug, Default)]
+struct KnownNodes {
+    own_run: Option<String>,
+    others: HashMap<String, Pulse>,
+}
+
+#[derive(Debug)]
+struct Pulse {
+    beat: u64,
+    /// When the beat last moved; `None`: the server is dead.
+    moved_at: Option<Instant>,
+}
+
+/// What changed among the other servers.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub struct NodeChanges {
+    /// Runs that live now.
+    pub began: Vec<String>,
+    /// Runs that are dead now.
+    pub ended: Vec<String>,
+}
+
+impl LiveNodes {
+    /// This server serves as `run` from now on.
+    pub fn join(&self, run: &str) {
+        self.known().own_run = Some(run.to_owned());
+    }
+
+    /// The run of this server; `None`: it is in no cluster.
+    pub fn own_run(&self) -> Option<String> {
+        self.known().own_run.clone()
+    }
+
+    /// The live runs, this server's among them.
+    pub fn runs(&self) -> Vec<String> {
+        let known = self.known();
+        let others = known.others.iter().filter(|(_, pulse)| pulse.moved_at.is_some());
+        known.own_run.iter().chain(others.map(|(run, _)| run)).cloned().collect()
+    }
+
+    /// Whether the run lives.
+    pub fn is_live(&self, run: &str) -> bool {
+        let known = self.known();
+        known.own_run.as_deref() == Some(run)
+            || known.others.get(run).is_some_and(|pulse| pulse.moved_at.is_some())
+    }
+
+    /// The number of live servers, with this one.
+    pub fn count(&self) -> usize {
+        self.runs().len().max(1)
+    }
+
+    /// Takes the runs and beats of all servers, as stored at `now`. A server is believed to live
+    /// when it is first seen, and dead at once when another run has its name.
+    pub fn observe<'a>(
+        &self,
+        beats: impl IntoIterator<Item = (&'a str, u64)>,
+        now: Instant,
+    ) -> NodeChanges {
+        let mut known = self.known();
+        let mut changes = NodeChanges::default();
+        let mut others = HashMap::new();
+        for (run, beat) in beats {
+            if known.own_run.as_deref() == Some(run) {
+                continue;
+            }
+            let before = known.others.remove(run);
+            let was_live = before.as_ref().is_some_and(|pulse| pulse.moved_at.is_some());
+            let moved_at = match before {
+                Some(pulse) if pulse.beat == beat => {
+                    pulse.moved_at.filter(|at| now.saturating_duration_since(*at) < MAX_REST)
+                }
+                _ => Some(now),
+            };
+            match (was_live, moved_at.is_some()) {
+                (false, true) => changes.began.push(run.to_owned()),
+                (true, false) => changes.ended.push(run.to_owned()),
+                _ => {}
+            }
+            others.insert(run.to_owned(), Pulse { beat, moved_at });
+        }
+        let gone = std::mem::replace(&mut known.others, others);
+        changes.ended.extend(
+            gone.into_iter().filter(|(_, pulse)| pulse.moved_at.is_some()).map(|(run, _)| run),
+        );
+        changes.ended.sort_unstable();
+        changes
+    }
+
+    fn known(&self) -> MutexGuard<'_, KnownNodes> {
+        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing
+        // half-done.
+        self.known.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn runs(names: &[&str]) -> Vec<String> {
+        names.iter().map(ToString::to_string).collect()
+    }
+
+    #[test]
+    fn node_whose_beat_rests_too_long_is_dead_until_it_moves_again() {
+        let (nodes, start) = (LiveNodes::default(), Instant::now());
+        assert_eq!((nodes.count(), nodes.runs()), (1, Vec::new()), "a server alone");
+        nodes.join("a-1");
+        let at = |seconds| start + Duration::from_secs(seconds);
+        let first = nodes.observe([("a-1", 1), ("b-1", 7)], at(0));
+        assert_eq!(first, NodeChanges { began: runs(&["b-1"]), ended: Vec::new() });
+        assert_eq!((nodes.count(), nodes.is_live("b-1")), (2, true));
+        assert_eq!(nodes.observe([("b-1", 7)], at(9)), NodeChanges::default());
+        let silent = nodes.observe([("b-1", 7)], at(10));
+        assert_eq!(silent, NodeChanges { began: Vec::new(), ended: runs(&["b-1"]) });
+        assert_eq!(nodes.runs(), runs(&["a-1"]));
+        assert_eq!(nodes.observe([("b-1", 7)], at(99)), NodeChanges::default());
+        assert_eq!(nodes.observe([("b-1", 8)], at(100)).began, runs(&["b-1"]));
+    }
+
+    #[test]
+    fn earlier_run_of_a_restarted_node_is_dead_at_once() {
+        let (nodes, now) = (LiveNodes::default(), Instant::now());
+        nodes.join("a-1");
+        nodes.observe([("b-1", 7)], now);
+        let restarted = nodes.observe([("b-2", 8)], now);
+        assert_eq!(restarted, NodeChanges { began: runs(&["b-2"]), ended: runs(&["b-1"]) });
+    }
+}

@@ -235,6 +235,15 @@ text_id!(
     }
 );
 text_id!(
+    /// The name of a server in a cluster, by default its host's.
+    NodeName like "rack-1" r"^[A-Za-z0-9_][A-Za-z0-9._-]{0,63}$",
+    "server name", "1 to 64 letters, digits, '.', '_' and '-', not starting with '.' or '-'", |t| {
+        t.len() <= 64
+            && t.bytes().next().is_some_and(|b| b.is_ascii_alphanumeric() || b == b'_')
+            && t.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-'))
+    }
+);
+text_id!(
     /// A file or directory on a robot, as named by the robot's administrator.
     AbsolutePath like "/opt/ros/jazzy/setup.bash" r"^/",
     "absolute path",

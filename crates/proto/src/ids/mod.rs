@@ -8,6 +8,6 @@ pub mod selector;
 pub(crate) use id::serde_by_text;
 pub use id::{
     AbsolutePath, DeploymentId, Generation, GraphName, InstanceId, InvalidId, LabelKey, LabelValue,
-    Labels, MacAddress, OutputPath, RepositoryName, RequestId, RobotId, RobotName, Tag, TaskName,
-    TokenId, UserName, Version,
+    Labels, MacAddress, NodeName, OutputPath, RepositoryName, RequestId, RobotId, RobotName, Tag,
+    TaskName, TokenId, UserName, Version,
 };

@@ -4,6 +4,7 @@
 //! names every setting, so the sources can't drift apart. This module also reads the file and
 //! resolves host names.
 
+mod cluster;
 mod oidc;
 mod settings;
 mod tables;
@@ -21,6 +22,8 @@ use task_proto::ids::LabelKey;
 use task_proto::messages::part::DEFAULT_PART_BYTES;
 use task_proto::messages::topic::TopicPrefix;
 
+use self::cluster::ClusterDraft;
+pub use self::cluster::{Bus, ClusterSettings};
 pub use self::oidc::{OidcSettings, RoleRule, private_url};
 use self::settings::{SETTINGS, Setting};
 pub use self::tables::{PersonRates, SiteLimits, TransferLimits};
@@ -91,6 +94,10 @@ pub struct Config {
     pub proxies: Vec<IpAddr>,
     /// Time from a stop signal to the stop, for a balancer and for robots to move to another server.
     pub drain: Duration,
+    /// This server's place in a cluster; absent: it is the only server on its database.
+    pub cluster: Option<ClusterSettings>,
+    /// The settings of `cluster` as read so far.
+    cluster_draft: Option<ClusterDraft>,
     /// The OpenID provider for sign-ins; without an issuer, such sign-ins are off.
     pub oidc: OidcSettings,
     /// Maximum size of one blob, in bytes.
@@ -312,6 +319,8 @@ impl Config {
             trusted_proxies: Vec::new(),
             proxies: Vec::new(),
             drain: Duration::ZERO,
+            cluster: None,
+            cluster_draft: None,
             oidc: OidcSettings::default(),
             max_blob_bytes: 16 << 30,
             max_upload_bytes: 4 << 30,
@@ -339,8 +348,8 @@ impl Config {
         };
         let mut config = Self::with_data(PathBuf::new());
         let file = flags.config.clone().or_else(|| variable("TASKD_CONFIG").map(PathBuf::from));
-        if let Some(path) = file {
-            config.apply_file(&path)?;
+        if let Some(path) = &file {
+            config.apply_file(path)?;
         }
         config.apply_environment(&environment)?;
         for (name, text) in &flags.settings {
@@ -356,6 +365,7 @@ impl Config {
             config.data = default_data_directory(variable).ok_or(ConfigError::NoDataDirectory)?;
         }
         config.check()?;
+        config.cluster = config.finish_cluster(file.as_deref())?;
         Ok(config)
     }
 
@@ -406,6 +416,11 @@ impl Config {
     /// Whether both listeners speak TLS.
     pub fn encrypts(&self) -> bool {
         self.tls.encrypts(self.exposed_listener().is_some(), self.allow_plaintext)
+    }
+
+    /// The settings of the cluster, to be read into.
+    fn cluster_mut(&mut self) -> &mut ClusterDraft {
+        self.cluster_draft.get_or_insert_default()
     }
 
     /// The setting `database`, if it names Postgres servers.

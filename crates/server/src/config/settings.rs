@@ -9,6 +9,7 @@ use task_proto::messages::part::{MAX_PART_BYTES, MIN_PART_BYTES};
 use task_proto::size::{format_bytes, parse_bytes};
 use task_proto::time::{parse_duration, parse_lifetime};
 
+use super::cluster::Bus;
 use super::oidc::{private_url, public_url};
 use super::{BlobRead, Config};
 use crate::domain::database_url;
@@ -263,6 +264,43 @@ pub(super) const SETTINGS: &[Setting] = &[
         help: "Time before a stop in which /readyz answers 503 and robots' sessions end one after the other; \
                see docs/cluster.md [default: 0s]",
         set: |config, text| drain(text).map(|time| config.drain = time),
+    },
+    Setting {
+        name: "cluster-name",
+        value_name: "NAME",
+        help: "Name of this server in its cluster [default: the host's name]",
+        set: |config, text| parsed(text).map(|name| config.cluster_mut().name = Some(name)),
+    },
+    Setting {
+        name: "cluster-url",
+        value_name: "URL",
+        help: "URL at which the other servers of the cluster reach this one; it makes this server a part of a \
+               cluster, see docs/cluster.md [default: none]",
+        set: |config, text| public_url(text).map(|url| config.cluster_mut().url = Some(url)),
+    },
+    Setting {
+        name: "cluster-secrets",
+        value_name: "DIR",
+        help: "Directory with the cluster's keys, which the server only reads; `taskd cluster export` makes one \
+               [default: the data directory]",
+        set: |config, text| {
+            config.cluster_mut().secrets = Some(PathBuf::from(non_empty(text)?));
+            Ok(())
+        },
+    },
+    Setting {
+        name: "cluster-bus",
+        value_name: "postgres|off",
+        help: "How the servers of a cluster notify each other; without it they find changes every ten seconds \
+               [default: postgres]",
+        set: |config, text| {
+            config.cluster_mut().bus = match text {
+                "postgres" => Bus::Postgres,
+                "off" => Bus::Off,
+                _ => return Err(format!("{text:?} is neither \"postgres\" nor \"off\"")),
+            };
+            Ok(())
+        },
     },
     Setting {
         name: "oidc-issuer",

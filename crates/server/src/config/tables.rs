@@ -1,7 +1,7 @@
-//! The tables of the configuration file: `[blobs]`, `[delivery]` with the operator's rules,
-//! `[transfers]` with the limits of each site, `[robots]` and `[people]` with rate limits, `[oidc]`,
-//! `[tls]`. A key with a single value is an ordinary setting; the rest is read here. Every error
-//! names its key.
+//! The tables of the configuration file: `[blobs]`, `[cluster]`, `[delivery]` with the operator's
+//! rules, `[transfers]` with the limits of each site, `[robots]` and `[people]` with rate limits,
+//! `[oidc]`, `[tls]`. A key with a single value is an ordinary setting; the rest is read here. Every
+//! error names its key.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -69,7 +69,15 @@ impl SiteLimits {
 pub(super) fn is_known(name: &str) -> bool {
     matches!(
         name,
-        "blobs" | "delivery" | "enrolment" | "oidc" | "people" | "robots" | "tls" | "transfers"
+        "blobs"
+            | "cluster"
+            | "delivery"
+            | "enrolment"
+            | "oidc"
+            | "people"
+            | "robots"
+            | "tls"
+            | "transfers"
     )
 }
 
@@ -82,6 +90,10 @@ impl Config {
     ) -> Result<(), ConfigError> {
         let origin =
             |key: String| Origin::File { key: format!("{name}.{key}"), path: path.to_owned() };
+        if name == "cluster" {
+            // An empty table is a mistake, and not a single server.
+            self.cluster_mut();
+        }
         for (key, value) in table {
             let setting = format!("{name}_{key}");
             let read = match (name, key.as_str()) {

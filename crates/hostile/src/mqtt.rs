@@ -182,7 +182,7 @@ impl Inbox for CheckingInbox {
         async { Ok(()) }.boxed()
     }
 
-    fn connected(&self, robot: &RobotId, _peer: Option<SocketAddr>, _connection: u64) {
+    fn connected(&self, robot: &RobotId, _: Option<SocketAddr>, _: u64, _: Option<u64>) {
         assert_eq!(robot.as_str(), ROBOT);
     }
 

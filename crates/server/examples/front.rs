@@ -45,7 +45,7 @@ impl Inbox for Connected {
         async { Ok(()) }.boxed()
     }
 
-    fn connected(&self, robot: &RobotId, _: Option<SocketAddr>, _: u64) {
+    fn connected(&self, robot: &RobotId, _: Option<SocketAddr>, _: u64, _: Option<u64>) {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).insert(robot.clone());
     }
 

@@ -3,6 +3,7 @@
 pub mod auth;
 pub mod blobs;
 pub mod broker;
+pub mod cluster;
 pub mod config;
 pub mod domain;
 pub mod fleet;

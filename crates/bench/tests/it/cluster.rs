@@ -18,13 +18,13 @@ use crate::harness::{Server, eventually, required, write_package};
 const TAKEOVER_TIMEOUT: Duration = Duration::from_secs(30);
 
 /// A new database, and a directory for the data of its servers.
-struct Cluster {
-    directory: TempDir,
-    database: String,
+pub struct Cluster {
+    pub directory: TempDir,
+    pub database: String,
 }
 
 impl Cluster {
-    async fn new() -> Self {
+    pub async fn new() -> Self {
         sqlx::any::install_default_drivers();
         let server = required("TASKD_TEST_POSTGRES");
         let name = format!("taskd_test_{:016x}", rand::random::<u64>());
@@ -38,7 +38,7 @@ impl Cluster {
         sqlx::AnyConnection::connect(&self.database).await.expect("the database answers")
     }
 
-    async fn execute(&self, sql: &str) {
+    pub async fn execute(&self, sql: &str) {
         let sql = sqlx::AssertSqlSafe(sql.to_owned());
         sqlx::query(sql).execute(&mut self.connect().await).await.expect("executed");
     }
@@ -52,7 +52,7 @@ impl Cluster {
     }
 
     /// A server's own data directory, in which the two for packages are shared.
-    fn data(&self, name: &str) -> PathBuf {
+    pub fn data(&self, name: &str) -> PathBuf {
         let data = self.directory.path().join(name);
         if !data.exists() {
             std::fs::create_dir(&data).expect("a directory");
@@ -89,7 +89,7 @@ impl Cluster {
     }
 }
 
-fn copy_keys(from: &Path, to: &Path) {
+pub fn copy_keys(from: &Path, to: &Path) {
     for name in ["signing.key", "operator.token"] {
         std::fs::copy(from.join(name), to.join(name)).expect("copied");
     }

@@ -2,8 +2,8 @@
 //! measures transfers. The proxy never inspects the bytes.
 
 use std::net::SocketAddr;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -14,6 +14,7 @@ pub struct Proxy {
     pub address: SocketAddr,
     to_client: Arc<AtomicU64>,
     bytes_per_s: Arc<AtomicU64>,
+    target: Arc<Mutex<SocketAddr>>,
 }
 
 impl Proxy {
@@ -25,20 +26,33 @@ impl Proxy {
             address: listener.local_addr().expect("bound"),
             to_client: Arc::default(),
             bytes_per_s: Arc::new(AtomicU64::new(bytes_per_s)),
+            target: Arc::new(Mutex::new(target)),
         };
         let counter = proxy.to_client.clone();
         let rate = proxy.bytes_per_s.clone();
+        let target = proxy.target.clone();
         tokio::spawn(async move {
             while let Ok((client, _)) = listener.accept().await {
+                let target = *target.lock().expect("no panic");
                 tokio::spawn(forward(client, target, counter.clone(), rate.clone()));
             }
         });
         proxy
     }
 
+    /// Listens without a limit, for a target that is set later.
+    pub async fn nowhere() -> Self {
+        Self::start(([127, 0, 0, 1], 1).into(), u64::MAX).await
+    }
+
     /// Bytes that were passed to clients so far.
     pub fn bytes_to_clients(&self) -> u64 {
         self.to_client.load(Ordering::SeqCst)
+    }
+
+    /// Forwards new connections to another server.
+    pub fn set_target(&self, target: SocketAddr) {
+        *self.target.lock().expect("no panic") = target;
     }
 
     pub fn set_rate(&self, bytes_per_s: u64) {

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use proc_macro2::{TokenStream, TokenTree};
 
 /// Entries of a directory of source beside its `mod.rs`, `lib.rs` and `main.rs`.
-const MAX_ENTRIES: usize = 13;
+const MAX_ENTRIES: usize = 14;
 /// The page's modules and styles.
 const PAGE: &str = "crates/server/ui";
 /// The server serves the files of the page below this path.

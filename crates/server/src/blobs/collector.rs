@@ -42,23 +42,31 @@ pub enum CollectError {
     Store(#[from] StoreError),
 }
 
-/// Collects at intervals until it is stopped.
+/// Collects at intervals until it is stopped, and at longer ones the more servers do the same,
+/// whose number is `servers`.
 pub async fn run(
     store: Store,
     blobs: Blobs,
     clock: Clock,
     grace: Duration,
+    servers: impl Fn() -> u32,
     stop: CancellationToken,
 ) {
     let [shortest, longest] = INTERVAL;
     let mut interval = tokio::time::interval((grace / 4).clamp(shortest, longest));
     interval.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    let mut ticks_to_wait = 1;
     loop {
         // Cancel-safe: the collection itself is not part of the select.
         tokio::select! {
             () = stop.cancelled() => return,
             _ = interval.tick() => {}
         }
+        ticks_to_wait -= 1;
+        if ticks_to_wait > 0 {
+            continue;
+        }
+        ticks_to_wait = servers().max(1);
         match collect(&store, &blobs, clock.now_ms(), grace).await {
             Ok(Collected { uploads: 0, blobs: 0 }) => {}
             Ok(Collected { uploads, blobs }) => {

@@ -127,9 +127,15 @@ pub trait Inbox: Send + Sync + 'static {
 
     /// A robot's session is live: [`Broker::send_desired`] reaches the robot from now on, so this
     /// is the moment to send its state. `connection` grows with every connection of this process.
-    /// Any earlier session of this robot has fully ended. With an external broker the peer is
-    /// unknown.
-    fn connected(&self, robot: &RobotId, peer: Option<SocketAddr>, connection: u64);
+    /// Any earlier session of this robot has fully ended. `token_number` is that of the token that
+    /// admitted it. With an external broker, peer and token are unknown.
+    fn connected(
+        &self,
+        robot: &RobotId,
+        peer: Option<SocketAddr>,
+        connection: u64,
+        token_number: Option<u64>,
+    );
 
     /// The robot's session with this number has ended. Called exactly once for each `connected`,
     /// after that call.
@@ -363,6 +369,23 @@ impl Broker {
         }
     }
 
+    /// Ends the robot's session unless the token `kept` has admitted it: the robot has used that
+    /// token for the first time, at another server.
+    pub fn disconnect_other_tokens(&self, robot: &RobotId, kept: u64) {
+        match &self.kind {
+            Kind::Embedded(front) => front.disconnect_other_tokens(robot, kept),
+            Kind::External(_) => {}
+        }
+    }
+
+    /// Ends the robot's session with this number: the robot has a newer one at another server.
+    pub fn disconnect_session(&self, robot: &RobotId, connection: u64) {
+        match &self.kind {
+            Kind::Embedded(front) => front.disconnect_session(robot, connection),
+            Kind::External(_) => {}
+        }
+    }
+
     /// Serves a client on a connection that another listener has accepted, once `handshake` ends.
     /// Returns false if the broker is external or has no room.
     pub fn serve_connection<S>(
@@ -385,6 +408,14 @@ impl Broker {
         match &self.kind {
             Kind::Embedded(front) => front.disconnect_person(user),
             // An external broker does not tell us its sessions.
+            Kind::External(_) => {}
+        }
+    }
+
+    /// Ends all people's sessions, because some person's rights may have ended. Clients reconnect.
+    pub fn disconnect_people(&self) {
+        match &self.kind {
+            Kind::Embedded(front) => front.disconnect_people(),
             Kind::External(_) => {}
         }
     }

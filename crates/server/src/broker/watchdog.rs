@@ -272,7 +272,7 @@ mod tests {
         fn receive(&self, _: RobotMessage) -> BoxFuture<'_, Result<(), NotStored>> {
             Box::pin(async { Err(NotStored) })
         }
-        fn connected(&self, _: &RobotId, _: Option<SocketAddr>, _: u64) {}
+        fn connected(&self, _: &RobotId, _: Option<SocketAddr>, _: u64, _: Option<u64>) {}
         fn disconnected(&self, _: &RobotId, _: u64) {}
         fn external_broker_connected(&self) {}
     }

@@ -33,7 +33,7 @@ pub enum Bus {
 
 /// [`ClusterSettings`] before all sources are read.
 #[derive(Debug, Clone, Default)]
-pub(super) struct ClusterDraft {
+pub(crate) struct ClusterDraft {
     pub(super) name: Option<NodeName>,
     pub(super) url: Option<String>,
     pub(super) secrets: Option<PathBuf>,
@@ -63,6 +63,11 @@ impl Config {
             let reason =
                 "a server of a cluster serves and is no standby; remove one of the two settings";
             return Err(invalid("standby", reason));
+        }
+        if self.broker.is_some() {
+            let reason =
+                "the servers of a cluster serve MQTT themselves; remove one of the two settings";
+            return Err(invalid("broker", reason));
         }
         let missing = "missing: the URL at which the other servers reach this one, like http://10.0.0.11:8080";
         let url = draft.url.ok_or_else(|| invalid("cluster.url", missing))?;
@@ -111,6 +116,7 @@ mod tests {
             (&[("TASKD_DATABASE", "sqlite:/x")], url, "cluster in taskd.toml: a cluster requires"),
             (&[POSTGRES], "[cluster]", "cluster.url in taskd.toml: missing"),
             (&[POSTGRES, ("TASKD_STANDBY", "true")], url, "standby in taskd.toml: a server of a"),
+            (&[POSTGRES, ("TASKD_BROKER", "mqtt://u:p@b")], url, "broker in taskd.toml: the servers"),
             (
                 &[POSTGRES],
                 "[cluster]\nname = \"a b\"",

@@ -97,7 +97,7 @@ pub struct Config {
     /// This server's place in a cluster; absent: it is the only server on its database.
     pub cluster: Option<ClusterSettings>,
     /// The settings of `cluster` as read so far.
-    cluster_draft: Option<ClusterDraft>,
+    pub(crate) cluster_draft: Option<ClusterDraft>,
     /// The OpenID provider for sign-ins; without an issuer, such sign-ins are off.
     pub oidc: OidcSettings,
     /// Maximum size of one blob, in bytes.

@@ -7,6 +7,7 @@ pub mod database_url;
 pub mod delivery;
 pub mod deployment;
 pub mod fleet_event;
+pub mod instance_history;
 pub mod limits;
 pub mod person;
 pub mod rollout;

@@ -7,6 +7,9 @@ use std::time::{Duration, Instant};
 
 /// The longest rest of a beat before its server counts as dead.
 const MAX_REST: Duration = Duration::from_secs(10);
+/// The longest time between two looks. What exceeds it does not count as rest, because the database
+/// was away or this server was stopped.
+const MAX_STEP: Duration = Duration::from_secs(4);
 
 /// The live servers. Clones share them.
 #[derive(Debug, Clone, Default)]
@@ -17,6 +20,8 @@ pub struct LiveNodes {
 #[derive(Debug, Default)]
 struct KnownNodes {
     own_run: Option<String>,
+    bus_problem: Option<String>,
+    observed_at: Option<Instant>,
     others: HashMap<String, Pulse>,
 }
 
@@ -47,6 +52,17 @@ impl LiveNodes {
         self.known().own_run.clone()
     }
 
+    /// Sets why the other servers' notifications do not arrive.
+    pub fn set_bus_problem(&self, problem: Option<String>) {
+        self.known().bus_problem = problem;
+    }
+
+    /// For people: why the other servers' notifications do not arrive; `None` if no problem is known.
+    pub fn bus_problem(&self) -> Option<String> {
+        let problem = self.known().bus_problem.clone()?;
+        Some(format!("notifications of the other servers do not arrive: {problem}"))
+    }
+
     /// The live runs, this server's among them.
     pub fn runs(&self) -> Vec<String> {
         let known = self.known();
@@ -75,6 +91,8 @@ impl LiveNodes {
     ) -> NodeChanges {
         let mut known = self.known();
         let mut changes = NodeChanges::default();
+        let before = known.observed_at.replace(now).unwrap_or(now);
+        let unseen = now.saturating_duration_since(before).saturating_sub(MAX_STEP);
         let mut others = HashMap::new();
         for (run, beat) in beats {
             if known.own_run.as_deref() == Some(run) {
@@ -84,7 +102,8 @@ impl LiveNodes {
             let was_live = before.as_ref().is_some_and(|pulse| pulse.moved_at.is_some());
             let moved_at = match before {
                 Some(pulse) if pulse.beat == beat => {
-                    pulse.moved_at.filter(|at| now.saturating_duration_since(*at) < MAX_REST)
+                    let moved_at = pulse.moved_at.map(|at| at + unseen);
+                    moved_at.filter(|at| now.saturating_duration_since(*at) < MAX_REST)
                 }
                 _ => Some(now),
             };
@@ -127,12 +146,25 @@ mod tests {
         let first = nodes.observe([("a-1", 1), ("b-1", 7)], at(0));
         assert_eq!(first, NodeChanges { began: runs(&["b-1"]), ended: Vec::new() });
         assert_eq!((nodes.count(), nodes.is_live("b-1")), (2, true));
-        assert_eq!(nodes.observe([("b-1", 7)], at(9)), NodeChanges::default());
+        for seconds in [3, 6, 9] {
+            assert_eq!(nodes.observe([("b-1", 7)], at(seconds)), NodeChanges::default());
+        }
         let silent = nodes.observe([("b-1", 7)], at(10));
         assert_eq!(silent, NodeChanges { began: Vec::new(), ended: runs(&["b-1"]) });
         assert_eq!(nodes.runs(), runs(&["a-1"]));
         assert_eq!(nodes.observe([("b-1", 7)], at(99)), NodeChanges::default());
         assert_eq!(nodes.observe([("b-1", 8)], at(100)).began, runs(&["b-1"]));
+    }
+
+    #[test]
+    fn time_in_which_nobody_could_look_is_no_rest() {
+        let (nodes, start) = (LiveNodes::default(), Instant::now());
+        nodes.join("a-1");
+        let at = |seconds| start + Duration::from_secs(seconds);
+        nodes.observe([("b-1", 7)], at(0));
+        assert_eq!(nodes.observe([("b-1", 7)], at(60)), NodeChanges::default());
+        assert_eq!(nodes.observe([("b-1", 7)], at(63)), NodeChanges::default());
+        assert_eq!(nodes.observe([("b-1", 7)], at(66)).ended, runs(&["b-1"]));
     }
 
     #[test]

@@ -7,3 +7,5 @@ pub mod presence;
 pub mod requests;
 pub mod robot_logs;
 pub mod robot_vitals;
+pub mod sessions_elsewhere;
+pub mod shared_presence;

@@ -1,17 +1,18 @@
 //! Presence of robots: whether a robot is connected over MQTT or polls over HTTP, its address,
 //! since when, and which robots have two instances that displace each other. Kept in memory only;
-//! this module never communicates and never reads a clock.
+//! in a cluster, what the other servers have shared is laid over it. This module never communicates
+//! and never reads a clock.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::HashMap;
 use std::net::SocketAddr;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use task_proto::{Digest, InstanceId, RobotId};
 
-/// Two returns of a displaced instance within this time mean a duplicate. After the same time
-/// without a change the duplicate is over.
-pub const DUPLICATE_WINDOW_MS: u64 = 10 * 60 * 1000;
+use super::shared_presence::{SessionHere, SharedPresence};
+use crate::domain::instance_history::InstanceHistory;
+
 /// Silence of the serving instance before another instance takes over the robot's work. An MQTT
 /// session without a sign of life ends within this time, and an agent without a session polls more
 /// often.
@@ -20,15 +21,15 @@ pub const HANDOVER_SILENCE_MS: u64 = 30 * 1000;
 const WAIT_DISPLAY_MS: u64 = 60 * 1000;
 /// Maximum robots in memory; beyond the limit, the longest silent robots are forgotten.
 const MAX_ROBOTS: usize = 100_000;
-/// Maximum instance changes in memory for each robot.
-const MAX_CHANGES: usize = 8;
 
-/// All robots that this process has seen.
+/// All robots that this process has seen, and those that other servers of the cluster see.
 pub struct Presence {
     window_ms: u64,
     /// Robots not seen since then count as offline since then.
     started_ms: AtomicU64,
     robots: Mutex<HashMap<RobotId, PresenceRecord>>,
+    /// The exchange with the other servers; `None`: this server is alone.
+    shared: Option<SharedPresence>,
 }
 
 /// The presence of one robot.
@@ -38,9 +39,9 @@ pub struct RobotPresence {
     pub online: bool,
     /// The last known address, if any. Port 0: the client of a trusted proxy, with an unknown port.
     pub address: Option<SocketAddr>,
-    /// Start of the MQTT connection, if connected.
+    /// Start of the MQTT connection, if connected here or at another server.
     pub connected_since_ms: Option<u64>,
-    /// The number of that connection.
+    /// The number of that connection, if it is to this server.
     pub connection: Option<u64>,
     /// Time of the last message or request.
     pub last_seen_ms: u64,
@@ -95,6 +96,10 @@ struct PresenceRecord {
     session_instance: Option<InstanceId>,
     /// When another instance was last told to wait.
     last_wait_ms: Option<u64>,
+    /// The token that admitted the last MQTT session.
+    token_number: u64,
+    /// The last message or request that other servers were told of.
+    shared_ms: Option<u64>,
 }
 
 #[derive(Clone, Copy)]
@@ -106,7 +111,17 @@ struct Connection {
 impl Presence {
     /// Starts with no robots. A polling robot is online for `window_ms` after its last request.
     pub fn new(window_ms: u64, now_ms: u64) -> Self {
-        Self { window_ms, started_ms: now_ms.into(), robots: Mutex::default() }
+        Self { window_ms, started_ms: now_ms.into(), robots: Mutex::default(), shared: None }
+    }
+
+    /// Shares what is seen with the other servers of the cluster.
+    pub fn share(self, shared: SharedPresence) -> Self {
+        Self { shared: Some(shared), ..self }
+    }
+
+    /// The exchange with the other servers; `None`: this server is alone.
+    pub fn shared(&self) -> Option<&SharedPresence> {
+        self.shared.as_ref()
     }
 
     /// Counts robots that are not seen as offline since `now_ms`: a standby, which could not see
@@ -129,7 +144,13 @@ impl Presence {
             record.session_ended(now_ms);
             record.connection = Some(Connection { number: connection, since_ms: now_ms });
             record.address = address.or(record.address);
+            self.to_share(robot);
         }
+    }
+
+    /// The robot's MQTT session is admitted by this token.
+    pub fn admitted_by(&self, robot: &RobotId, token_number: u64) {
+        entry(&mut self.robots(), robot).token_number = token_number;
     }
 
     /// The robot's MQTT session number `connection` ended. An end that arrives after the next
@@ -142,12 +163,47 @@ impl Presence {
             record.connection = None;
             record.polled_ms = None;
             record.last_seen_ms = record.last_seen_ms.max(Some(now_ms));
+            self.to_share(robot);
         }
     }
 
     /// The robot sent an HTTP request.
     pub fn seen(&self, robot: &RobotId, address: SocketAddr, now_ms: u64) {
-        touch(&mut self.robots(), robot, Some(address), now_ms).polled_ms = Some(now_ms);
+        let mut robots = self.robots();
+        let record = touch(&mut robots, robot, Some(address), now_ms);
+        record.polled_ms = Some(now_ms);
+        let is_shared =
+            record.shared_ms.is_some_and(|at_ms| now_ms.saturating_sub(at_ms) < self.window_ms / 2);
+        if record.connection.is_none() && !is_shared {
+            self.to_share(robot);
+        }
+    }
+
+    /// The robot's session at this server, for the others. `None`: the robot is offline here.
+    pub fn session_here(&self, robot: &RobotId, now_ms: u64) -> Option<SessionHere> {
+        let mut robots = self.robots();
+        let record = robots.get_mut(robot)?;
+        let seen = record.view(self.window_ms, now_ms).filter(|seen| seen.online);
+        record.shared_ms = seen.as_ref().map(|_| now_ms);
+        seen.map(|seen| SessionHere {
+            token_number: record.token_number,
+            connection: seen.connection,
+            since_ms: seen.connected_since_ms,
+            seen_ms: seen.last_seen_ms,
+            address: seen.address,
+        })
+    }
+
+    /// Has all sessions at this server shared again.
+    pub fn share_all(&self) {
+        let robots: Vec<RobotId> = self.robots().keys().cloned().collect();
+        robots.iter().for_each(|robot| self.to_share(robot));
+    }
+
+    fn to_share(&self, robot: &RobotId) {
+        if let Some(shared) = &self.shared {
+            shared.unwritten.add(robot);
+        }
     }
 
     /// The robot's agent identified itself, in the MQTT session number `connection` if in a
@@ -163,13 +219,18 @@ impl Presence {
     ) -> Admission {
         let mut robots = self.robots();
         let record = touch(&mut robots, robot, address, now_ms);
-        record.instances.observe(&agent.instance, now_ms);
+        let is_new_instance = record.instances.observe(&agent.instance, now_ms);
         let is_current_session =
             connection.is_some() && connection == record.connection.map(|known| known.number);
         let is_first_in_session =
             is_current_session && record.session_instance.as_ref() != Some(&agent.instance);
         if is_current_session {
             record.session_instance = Some(agent.instance.clone());
+        }
+        if let Some(shared) = &self.shared
+            && (is_new_instance || is_first_in_session || shared.elsewhere.is_online(robot))
+        {
+            shared.instances.add(robot, &agent.instance, now_ms);
         }
         if !record.hands_over_to(&agent, now_ms) {
             record.last_wait_ms = Some(now_ms);
@@ -207,9 +268,34 @@ impl Presence {
         self.robots().get(robot)?.serving.as_ref().map(|(serving, _)| serving.instance.clone())
     }
 
-    /// The presence of the robot; `None` if this process has not seen the robot.
+    /// The presence of the robot; `None` if neither this process nor another server of the cluster
+    /// has seen the robot.
     pub fn get(&self, robot: &RobotId, now_ms: u64) -> Option<RobotPresence> {
-        self.robots().get(robot)?.view(self.window_ms, now_ms)
+        let here = self.robots().get(robot).and_then(|record| record.view(self.window_ms, now_ms));
+        match &self.shared {
+            Some(shared) => shared.elsewhere.overlay(robot, here),
+            None => here,
+        }
+    }
+
+    /// Whether the robot is online at another server of the cluster, and not here. A robot that is
+    /// connected there may send requests to this one.
+    pub fn is_elsewhere(&self, robot: &RobotId, now_ms: u64) -> bool {
+        let Some(shared) = &self.shared else { return false };
+        let here = self.robots().get(robot).and_then(|record| record.view(self.window_ms, now_ms));
+        match here {
+            Some(here) if here.connection.is_some() => false,
+            Some(here) if here.online => shared.elsewhere.is_connected(robot),
+            _ => shared.elsewhere.is_online(robot),
+        }
+    }
+
+    /// The robot's connection to another server has ended: a robot that disconnects is offline
+    /// until its next request.
+    pub fn disconnected_elsewhere(&self, robot: &RobotId) {
+        if let Some(record) = self.robots().get_mut(robot) {
+            record.polled_ms = None;
+        }
     }
 
     /// Whether the robot is online.
@@ -224,15 +310,13 @@ impl Presence {
         robots: impl IntoIterator<Item = &'a RobotId>,
         now_ms: u64,
     ) -> Vec<Option<u64>> {
-        let known = self.robots();
         let started_ms = self.started_ms.load(Ordering::Relaxed);
         let offline_ms = |robot: &RobotId| {
-            let since_ms =
-                match known.get(robot).and_then(|record| record.view(self.window_ms, now_ms)) {
-                    Some(sighting) if sighting.online => return None,
-                    Some(sighting) => sighting.last_seen_ms.max(started_ms),
-                    None => started_ms,
-                };
+            let since_ms = match self.get(robot, now_ms) {
+                Some(sighting) if sighting.online => return None,
+                Some(sighting) => sighting.last_seen_ms.max(started_ms),
+                None => started_ms,
+            };
             Some(now_ms.saturating_sub(since_ms))
         };
         robots.into_iter().map(offline_ms).collect()
@@ -246,6 +330,13 @@ impl Presence {
     /// Robots without a connection that were online at `since_ms` and are offline at `now_ms`,
     /// because the window passed without a request.
     pub fn timed_out(&self, since_ms: u64, now_ms: u64) -> Vec<RobotId> {
+        let mut fell = self.timed_out_here(since_ms, now_ms);
+        fell.iter().for_each(|robot| self.to_share(robot));
+        fell.retain(|robot| !self.is_elsewhere(robot, now_ms));
+        fell
+    }
+
+    fn timed_out_here(&self, since_ms: u64, now_ms: u64) -> Vec<RobotId> {
         let robots = self.robots();
         let fell = robots.iter().filter(|(_, record)| {
             let ends_ms =
@@ -269,9 +360,25 @@ impl Presence {
         }
     }
 
+    /// The same, with the other servers of the cluster.
+    pub fn end_other_instances_everywhere(&self, robot: &RobotId) {
+        self.end_other_instances(robot);
+        if let Some(shared) = &self.shared {
+            shared.instances.reset(robot);
+        }
+    }
+
+    /// The instances of the robot that any server of the cluster has seen.
+    pub fn set_instances(&self, robot: &RobotId, instances: InstanceHistory) {
+        if let Some(record) = self.robots().get_mut(robot) {
+            record.instances = instances;
+        }
+    }
+
     /// The robot was removed.
     pub fn forget(&self, robot: &RobotId) {
         self.robots().remove(robot);
+        self.to_share(robot);
     }
 
     fn robots(&self) -> MutexGuard<'_, HashMap<RobotId, PresenceRecord>> {
@@ -373,49 +480,6 @@ impl PresenceRecord {
     }
 }
 
-/// The instances of one robot, by the time at which each displaced another.
-///
-/// A restarted agent is a new instance, and an old instance never comes back, except in a late
-/// message. So two *returns* within [`DUPLICATE_WINDOW_MS`] (A, B, A again, B again) mean that two
-/// machines share the identity.
-#[derive(Debug, Clone, Default)]
-pub struct InstanceHistory {
-    changes: VecDeque<Change>,
-    /// The last return that made the robot a duplicate, or kept the robot one.
-    duplicate_at_ms: Option<u64>,
-}
-
-#[derive(Debug, Clone)]
-struct Change {
-    instance: InstanceId,
-    at_ms: u64,
-    is_return: bool,
-}
-
-impl InstanceHistory {
-    /// Records a message or request of `instance`.
-    pub fn observe(&mut self, instance: &InstanceId, now_ms: u64) {
-        if self.changes.back().is_some_and(|last| last.instance == *instance) {
-            return;
-        }
-        let is_return = self.changes.iter().any(|change| change.instance == *instance);
-        self.changes.push_back(Change { instance: instance.clone(), at_ms: now_ms, is_return });
-        if self.changes.len() > MAX_CHANGES {
-            self.changes.pop_front();
-        }
-        let recent = |change: &&Change| now_ms.saturating_sub(change.at_ms) < DUPLICATE_WINDOW_MS;
-        let returns = self.changes.iter().filter(recent).filter(|change| change.is_return).count();
-        if is_return && (returns >= 2 || self.is_duplicate(now_ms)) {
-            self.duplicate_at_ms = Some(now_ms);
-        }
-    }
-
-    /// Whether instances displaced each other and have not been quiet since.
-    pub fn is_duplicate(&self, now_ms: u64) -> bool {
-        self.duplicate_at_ms.is_some_and(|at_ms| now_ms.saturating_sub(at_ms) < DUPLICATE_WINDOW_MS)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -424,55 +488,6 @@ mod tests {
 
     fn address() -> SocketAddr {
         "127.0.0.1:4000".parse().expect("an address")
-    }
-
-    fn history(observed: &[(&InstanceId, u64)]) -> InstanceHistory {
-        let mut history = InstanceHistory::default();
-        for (instance, at_ms) in observed {
-            history.observe(instance, *at_ms);
-        }
-        history
-    }
-
-    #[test]
-    fn two_returns_within_the_window_are_a_duplicate() {
-        let (a, b) = (InstanceId::random(), InstanceId::random());
-        let three = history(&[(&a, 0), (&b, 1), (&b, 2), (&a, 3)]);
-        assert!(!three.is_duplicate(3), "one return may be a late message");
-        let mut four = three;
-        four.observe(&b, 4);
-        assert!(four.is_duplicate(4));
-        assert!(four.is_duplicate(4 + DUPLICATE_WINDOW_MS - 1));
-        assert!(!four.is_duplicate(4 + DUPLICATE_WINDOW_MS), "ten quiet minutes clear it");
-    }
-
-    #[test]
-    fn returns_keep_a_duplicate_alive_and_repeats_do_not() {
-        let (a, b) = (InstanceId::random(), InstanceId::random());
-        let mut both = history(&[(&a, 0), (&b, 1), (&a, 2), (&b, 3)]);
-        both.observe(&a, 9 * MINUTE_MS);
-        both.observe(&a, 18 * MINUTE_MS);
-        assert!(both.is_duplicate(18 * MINUTE_MS));
-        assert!(!both.is_duplicate(19 * MINUTE_MS));
-    }
-
-    #[test]
-    fn restarts_and_slow_alternation_are_no_duplicate() {
-        let fresh: Vec<InstanceId> = (0..40).map(|_| InstanceId::random()).collect();
-        let mut restarts = InstanceHistory::default();
-        for (second, instance) in (0..).zip(&fresh) {
-            restarts.observe(instance, second * 1000);
-            assert!(!restarts.is_duplicate(second * 1000));
-        }
-        let (a, b) = (&fresh[0], &fresh[1]);
-        let slow = history(&[(a, 0), (b, 8 * MINUTE_MS), (a, 16 * MINUTE_MS), (b, 27 * MINUTE_MS)]);
-        assert!(!slow.is_duplicate(27 * MINUTE_MS));
-    }
-
-    #[test]
-    fn three_clones_are_a_duplicate_too() {
-        let (a, b, c) = (InstanceId::random(), InstanceId::random(), InstanceId::random());
-        assert!(history(&[(&a, 0), (&b, 1), (&c, 2), (&a, 3), (&b, 4)]).is_duplicate(4));
     }
 
     #[test]

@@ -210,6 +210,11 @@ impl EventFeed {
         Ok(SubscriberSlot { subscribers: self.subscribers.clone(), subscriber })
     }
 
+    /// The number of open streams.
+    pub fn listeners(&self) -> usize {
+        self.lines.receiver_count()
+    }
+
     /// Turns notices into events with these views until `stop`.
     pub async fn run(self, views: Views, changes: Changes, stop: CancellationToken) {
         let mut notices = changes.subscribe();
@@ -257,6 +262,7 @@ impl EventFeed {
                     );
                 }
                 Change::Scopes => self.send(&Event::Missed, Audience::Limited),
+                Change::Missed => self.send(&Event::Missed, Audience::Everyone),
                 Change::Package(name) => self.send(&Event::Package { name }, Audience::Everyone),
                 Change::Deployment(id) => drop(deployments.insert(id)),
                 Change::Feed { first, last } => {

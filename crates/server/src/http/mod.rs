@@ -33,6 +33,7 @@ use task_proto::people::roles::Permission;
 use tokio_util::sync::CancellationToken;
 use utoipa::OpenApi;
 
+use self::accounts::person_sessions::PersonSessions;
 use self::accounts::session::{PageCookies, PageSignIn};
 use self::events::EventStreams;
 use self::fleet::broker::BrokerAccounts;
@@ -49,6 +50,7 @@ use crate::auth::oidc::Provider;
 use crate::blobs::Blobs;
 use crate::broker::Broker;
 use crate::domain::limits::robot_limiter::RobotLimiter;
+use crate::fleet::live_nodes::LiveNodes;
 use crate::fleet::presence::Presence;
 use crate::fleet::requests::Requests;
 use crate::fleet::robot_logs::RobotLogs;
@@ -129,6 +131,8 @@ pub struct AppParts {
     pub data: PathBuf,
     /// Health of the server's components.
     pub readiness: Readiness,
+    /// The live servers of the cluster.
+    pub nodes: LiveNodes,
     /// Cancelled when the server stops.
     pub stop: CancellationToken,
 }
@@ -169,6 +173,7 @@ parts! {
     facts: Arc<ServerFacts>,
     lists: Arc<SharedLists>,
     mqtt: Arc<MqttAccess>,
+    nodes: LiveNodes,
     readiness: Readiness,
     reports: ReportWriter,
     stop: CancellationToken,
@@ -192,13 +197,14 @@ composite_parts! {
     BrokerAccounts { mqtt, store }
     EventStreams { changes, clock, events, stop, store }
     Gauges {
-        blobs, broker, clock, data, facts, http_traffic, presence, reports, robot_limiter,
+        blobs, broker, clock, data, facts, http_traffic, nodes, presence, reports, robot_limiter,
         slow_figures, store, transfers,
     }
     LiveRobots {
         broker, changes, clock, desired_states, http_connections, logs, presence, requests, vitals,
     }
     PageSignIn { changes, clock, cookies, provider, store }
+    PersonSessions { broker, changes }
     Registry { blobs, changes, clock, readers, store, transfers }
     Views { clock, presence, robot_limiter, store, vitals }
 }

@@ -65,6 +65,7 @@ impl StoreGatekeeper {
                         &self.http_connections,
                         &self.changes,
                         &robot,
+                        token_number,
                     );
                 }
                 Ok(Principal::Robot { robot, token_number, is_first_use })
@@ -97,9 +98,11 @@ pub fn announce_new_token(
     http_connections: &HttpConnections,
     changes: &Changes,
     robot: &RobotId,
+    token_number: u64,
 ) {
-    presence.end_other_instances(robot);
+    presence.end_other_instances_everywhere(robot);
     http_connections.end(robot);
+    changes.end_robot_elsewhere(robot, Some(token_number));
     changes.announce(Change::Robot(robot.clone()));
-    changes.notify_robots([robot.clone()]);
+    changes.notify_robots_here([robot.clone()]);
 }

@@ -6,6 +6,7 @@
 use std::collections::HashMap;
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Instant;
 
 use futures_util::FutureExt as _;
 use futures_util::future::BoxFuture;
@@ -139,7 +140,7 @@ impl Uplink {
         match parsed::<Telemetry>(message, MAX_TELEMETRY_BYTES) {
             Some(said) if said.robot_id == message.robot => {
                 self.vitals.record(&message.robot, said.vitals, self.clock.now_ms());
-                self.changes.announce(Change::Robot(said.robot_id));
+                self.changes.announce_here(Change::Robot(said.robot_id));
             }
             Some(said) => {
                 tracing::warn!(robot = %message.robot, claimed = %said.robot_id, "vitals with another robot's id are dropped");
@@ -171,7 +172,7 @@ impl Uplink {
             return;
         }
         notified_ms.insert(robot.clone(), now_ms);
-        self.changes.notify_robots([robot.clone()]);
+        self.changes.notify_robots_here([robot.clone()]);
     }
 }
 
@@ -195,25 +196,34 @@ impl Inbox for Uplink {
         .boxed()
     }
 
-    fn connected(&self, robot: &RobotId, peer: Option<SocketAddr>, connection: u64) {
-        let was_online = self.presence.is_online(robot, self.clock.now_ms());
-        self.presence.connected(robot, peer, connection, self.clock.now_ms());
-        self.changes.announce(Change::Robot(robot.clone()));
-        if !was_online {
-            self.changes.announce_event(FleetEvent::Presence(robot.clone(), true));
-        }
-        self.changes.notify_robots([robot.clone()]);
+    fn connected(
+        &self,
+        robot: &RobotId,
+        peer: Option<SocketAddr>,
+        connection: u64,
+        token_number: Option<u64>,
+    ) {
+        let now_ms = self.clock.now_ms();
+        let was_online = self.presence.is_online(robot, now_ms);
+        self.presence.admitted_by(robot, token_number.unwrap_or(0));
+        self.presence.connected(robot, peer, connection, now_ms);
+        self.changes.announce_here(Change::Robot(robot.clone()));
+        announce_arrival(&self.presence, &self.changes, robot, was_online);
+        self.changes.notify_robots_here([robot.clone()]);
         self.logs.connected(robot);
     }
 
     fn disconnected(&self, robot: &RobotId, connection: u64) {
         self.presence.disconnected(robot, connection, self.clock.now_ms());
         self.notified_ms.lock().unwrap_or_else(PoisonError::into_inner).remove(robot);
-        self.changes.announce(Change::Robot(robot.clone()));
-        self.changes.announce_event(FleetEvent::Presence(
-            robot.clone(),
-            self.presence.is_online(robot, self.clock.now_ms()),
-        ));
+        self.changes.announce_here(Change::Robot(robot.clone()));
+        let is_online = self.presence.is_online(robot, self.clock.now_ms());
+        match self.presence.shared() {
+            Some(shared) => shared.departed(robot, Instant::now()),
+            None => {
+                self.changes.announce_event(FleetEvent::Presence(robot.clone(), is_online));
+            }
+        }
     }
 
     fn external_broker_connected(&self) {
@@ -243,7 +253,7 @@ pub fn record_agent(
         changes.announce(Change::Robot(robot.clone()));
     }
     if admission.needs_state {
-        changes.notify_robots([robot.clone()]);
+        changes.notify_robots_here([robot.clone()]);
     }
     admission.is_serving
 }
@@ -259,7 +269,17 @@ pub fn record_http_request(
     let was_online = presence.is_online(robot, now_ms);
     presence.seen(robot, peer, now_ms);
     if !was_online {
-        changes.announce(Change::Robot(robot.clone()));
+        changes.announce_here(Change::Robot(robot.clone()));
+        announce_arrival(presence, changes, robot, was_online);
+    }
+}
+
+/// Announces a robot that was offline. In a cluster, one that was at a server a moment ago, this or
+/// another, has not been away.
+fn announce_arrival(presence: &Presence, changes: &Changes, robot: &RobotId, was_online: bool) {
+    let has_returned =
+        presence.shared().is_some_and(|shared| shared.returned(robot, Instant::now()));
+    if !was_online && !has_returned {
         changes.announce_event(FleetEvent::Presence(robot.clone(), true));
     }
 }

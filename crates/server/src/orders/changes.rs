@@ -1,35 +1,22 @@
 //! Announces changes after the commit: notices for the event stream, and the robots whose desired
-//! state is new. Nothing here has to survive a crash: both sides compare again on connect.
+//! state is new. Nothing here has to survive a crash: both sides compare again on connect. In a
+//! cluster, what happens here is also put into an outbox for the other servers.
 
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use task_proto::{DeploymentId, RobotId, TaskName};
+use task_proto::{DeploymentId, RobotId, UserName};
 use tokio::sync::{Notify, broadcast, watch};
 
+pub use super::change::{Change, RobotsToNotify};
+use super::outbox::Outbox;
 use crate::domain::fleet_event::FleetEvent;
 use crate::fleet::part_requests::PartRequests;
-use crate::store::KnownRobot;
 
 /// Capacity of a channel: a receiver that falls further behind misses entries.
 const CHANNEL_CAPACITY: usize = 16 * 1024;
-
-/// One created, changed or removed object. The listener reads the current value from the store.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Change {
-    /// A robot is new or has changed.
-    Robot(RobotId),
-    /// A robot was removed.
-    RobotRemoved(Box<KnownRobot>),
-    /// A robot may have entered or left some user's scope.
-    Scopes,
-    /// A deployment is new or has changed.
-    Deployment(DeploymentId),
-    /// A package was pushed or deleted.
-    Package(TaskName),
-    /// The feed has entries with these numbers.
-    Feed { first: u64, last: u64 },
-}
+/// Capacity of the channel of deployments and removed robots.
+const HERE_CAPACITY: usize = 4 * 1024;
 
 /// Changes of a write, collected on the way and announced after its commit.
 #[derive(Debug, Default)]
@@ -48,10 +35,22 @@ pub struct PendingNotifications {
 #[derive(Debug, Clone)]
 pub struct Changes {
     notices: broadcast::Sender<Change>,
+    /// The notices of what happened at this server.
+    notices_here: broadcast::Sender<Change>,
+    origin: Origin,
     fleet_events: broadcast::Sender<FleetEvent>,
     wake_queue: Arc<WakeQueue>,
     rights: Arc<watch::Sender<()>>,
     part_requests: PartRequests,
+}
+
+/// Where the announced changes happen.
+#[derive(Debug, Clone)]
+enum Origin {
+    /// At this server; the outbox is for the others of its cluster.
+    Here(Option<Outbox>),
+    /// At another server.
+    Elsewhere,
 }
 
 /// Robots to notify: a set, so a robot waits here once however often its desired state changes.
@@ -61,18 +60,12 @@ struct WakeQueue {
     added: Notify,
 }
 
-/// The robots to notify.
-#[derive(Debug, Default, PartialEq, Eq)]
-pub struct RobotsToNotify {
-    /// Whether all robots are to be notified.
-    pub all: bool,
-    pub robots: BTreeSet<RobotId>,
-}
-
 impl Changes {
     pub fn new() -> Self {
         Self {
             notices: broadcast::Sender::new(CHANNEL_CAPACITY),
+            notices_here: broadcast::Sender::new(HERE_CAPACITY),
+            origin: Origin::Here(None),
             fleet_events: broadcast::Sender::new(CHANNEL_CAPACITY),
             wake_queue: Arc::default(),
             rights: Arc::new(watch::Sender::new(())),
@@ -80,9 +73,48 @@ impl Changes {
         }
     }
 
+    /// Puts what is announced also into `outbox`, for the other servers of the cluster.
+    pub fn with_outbox(self, outbox: Outbox) -> Self {
+        Self { origin: Origin::Here(Some(outbox)), ..self }
+    }
+
+    /// Announces to the same listeners what happened at another server.
+    pub fn from_elsewhere(&self) -> Self {
+        Self { origin: Origin::Elsewhere, ..self.clone() }
+    }
+
+    fn outbox(&self) -> Option<&Outbox> {
+        match &self.origin {
+            Origin::Here(outbox) => outbox.as_ref(),
+            Origin::Elsewhere => None,
+        }
+    }
+
     /// Tells long-lived connections that users or their tokens have changed.
     pub fn announce_rights(&self) {
         self.rights.send_replace(());
+        if let Some(outbox) = self.outbox() {
+            outbox.add(|news| news.rights = true);
+        }
+    }
+
+    /// Has the other servers of the cluster end the robot's connections, except those by the token
+    /// `kept`.
+    pub fn end_robot_elsewhere(&self, robot: &RobotId, kept: Option<u64>) {
+        if let Some(outbox) = self.outbox() {
+            outbox.add(|news| {
+                news.robots_to_end.insert(robot.clone(), kept);
+            });
+        }
+    }
+
+    /// Has the other servers of the cluster end the person's MQTT sessions.
+    pub fn end_person_elsewhere(&self, user: &UserName) {
+        if let Some(outbox) = self.outbox() {
+            outbox.add(|news| {
+                news.people_to_end.insert(user.clone());
+            });
+        }
     }
 
     /// Changes each time that people or their tokens have changed, from now on.
@@ -100,8 +132,27 @@ impl Changes {
         self.notices.subscribe()
     }
 
+    /// Every notice from now on of what happened at this server.
+    pub fn subscribe_here(&self) -> broadcast::Receiver<Change> {
+        self.notices_here.subscribe()
+    }
+
     /// Tells all listeners; no listener is fine.
     pub fn announce(&self, change: Change) {
+        if let Origin::Here(outbox) = &self.origin {
+            // Only the feed listens, and only to these.
+            if matches!(change, Change::Deployment(_) | Change::RobotRemoved(_)) {
+                let _ = self.notices_here.send(change.clone());
+            }
+            if let Some(outbox) = outbox {
+                outbox.add_change(&change);
+            }
+        }
+        let _ = self.notices.send(change);
+    }
+
+    /// Tells the listeners of this server; those of others learn of it by other means, or need not.
+    pub fn announce_here(&self, change: Change) {
         let _ = self.notices.send(change);
     }
 
@@ -127,8 +178,17 @@ impl Changes {
         self.notify_robots(notifications.to_notify);
     }
 
-    /// Queues notifications to `robots` about their new desired state.
+    /// Queues notifications to `robots` about their new desired state, wherever they are connected.
     pub fn notify_robots(&self, robots: impl IntoIterator<Item = RobotId>) {
+        let robots: Vec<RobotId> = robots.into_iter().collect();
+        if let Some(outbox) = self.outbox().filter(|_| !robots.is_empty()) {
+            outbox.add(|news| news.to_notify.robots.extend(robots.iter().cloned()));
+        }
+        self.notify_robots_here(robots);
+    }
+
+    /// Queues notifications to `robots`, if they are connected to this server.
+    pub fn notify_robots_here(&self, robots: impl IntoIterator<Item = RobotId>) {
         let mut waiting = self.wake_queue.waiting.lock().unwrap_or_else(PoisonError::into_inner);
         waiting.robots.extend(robots);
         if !waiting.robots.is_empty() {
@@ -138,6 +198,9 @@ impl Changes {
 
     /// Queues notifications to all robots about their desired state.
     pub fn notify_all_robots(&self) {
+        if let Some(outbox) = self.outbox() {
+            outbox.add(|news| news.to_notify.all = true);
+        }
         self.wake_queue.waiting.lock().unwrap_or_else(PoisonError::into_inner).all = true;
         self.wake_queue.added.notify_one();
     }
@@ -165,7 +228,34 @@ impl Default for Changes {
 
 #[cfg(test)]
 mod tests {
+    use super::super::outbox::News;
     use super::*;
+
+    #[test]
+    fn change_at_another_server_is_announced_and_not_sent_again() {
+        let outbox = Outbox::default();
+        let changes = Changes::new().with_outbox(outbox.clone());
+        outbox.set_listeners(true);
+        let (mut all, mut here) = (changes.subscribe(), changes.subscribe_here());
+        let (robot, deployment) = (RobotId::random(), DeploymentId::random());
+        let announce = |changes: &Changes| {
+            changes.announce(Change::Deployment(deployment.clone()));
+            changes.notify_robots([robot.clone()]);
+            changes.announce_rights();
+        };
+        announce(&changes.from_elsewhere());
+        assert_eq!(outbox.take(), News::default());
+        assert!(all.try_recv().is_ok() && here.try_recv().is_err());
+        announce(&changes);
+        let expected = News {
+            to_notify: RobotsToNotify { all: false, robots: BTreeSet::from([robot]) },
+            rights: true,
+            changes: BTreeSet::from([Change::Deployment(deployment)]),
+            ..News::default()
+        };
+        assert_eq!(outbox.take(), expected);
+        assert!(all.try_recv().is_ok() && here.try_recv().is_ok());
+    }
 
     #[tokio::test]
     async fn robot_queued_twice_is_taken_once() {

@@ -32,6 +32,8 @@ pub struct DeliveryPlanner {
 pub struct ServerLoad {
     transfers: AtomicU64,
     backlog: AtomicU64,
+    transfers_elsewhere: AtomicU64,
+    backlog_elsewhere: AtomicU64,
 }
 
 /// A robot's site: the value of its site label, otherwise the network of its address.
@@ -47,6 +49,26 @@ impl ServerLoad {
     pub fn set(&self, transfers: u64, backlog: u64) {
         self.transfers.store(transfers, Ordering::Relaxed);
         self.backlog.store(backlog, Ordering::Relaxed);
+    }
+
+    /// Sets the same figures of the other servers of the cluster, in total.
+    pub fn set_elsewhere(&self, transfers: u64, backlog: u64) {
+        self.transfers_elsewhere.store(transfers, Ordering::Relaxed);
+        self.backlog_elsewhere.store(backlog, Ordering::Relaxed);
+    }
+
+    /// The figures of this server.
+    pub fn here(&self) -> (u64, u64) {
+        (self.transfers.load(Ordering::Relaxed), self.backlog.load(Ordering::Relaxed))
+    }
+
+    /// The figures of all servers.
+    fn total(&self) -> (u64, u64) {
+        let (transfers, backlog) = self.here();
+        (
+            transfers.saturating_add(self.transfers_elsewhere.load(Ordering::Relaxed)),
+            backlog.saturating_add(self.backlog_elsewhere.load(Ordering::Relaxed)),
+        )
     }
 }
 
@@ -91,12 +113,13 @@ impl DeliveryPlanner {
         let order = write.deliveries().request(deployment).await?;
         let known = write.deliveries().robot_facts(batch, &order.package.content.digest).await?;
         let sites = self.robots_by_site(write, deployment, now_ms).await?;
+        let (transfers, backlog) = self.load.total();
         let common = Inputs {
             size: transfer_bytes(&order.package),
             robots: order.robots,
             batch: batch.len() as u64,
-            transfers: self.load.transfers.load(Ordering::Relaxed),
-            backlog: self.load.backlog.load(Ordering::Relaxed),
+            transfers,
+            backlog,
             ..Inputs::default()
         };
         let decide = |facts: RobotFacts| {
@@ -132,7 +155,9 @@ impl DeliveryPlanner {
         Inputs {
             lacking: missing_bytes(package, facts.has.as_ref()),
             same_site: sites.map(on_site),
-            connected: sighting.as_ref().is_some_and(|sighting| sighting.connection.is_some()),
+            connected: sighting
+                .as_ref()
+                .is_some_and(|sighting| sighting.connected_since_ms.is_some()),
             metered: facts
                 .labels
                 .iter()

@@ -58,7 +58,7 @@ async fn gather(
     changes: &Changes,
     stop: CancellationToken,
 ) {
-    let (mut events, mut notices) = (changes.fleet_events(), changes.subscribe());
+    let (mut events, mut notices) = (changes.fleet_events(), changes.subscribe_here());
     let mut health = source.broker.health();
     let (mut pending, mut tick_count) = (Pending::default(), 0u64);
     let (mut was_healthy, mut had_space) = (true, true);

@@ -13,6 +13,7 @@ use tokio::time::{Interval, MissedTickBehavior};
 use tokio_util::sync::CancellationToken;
 
 use crate::domain::fleet_event::FleetEvent;
+use crate::fleet::live_nodes::LiveNodes;
 use crate::http::App;
 use crate::orders::changes::Change;
 use crate::orders::delivery_planner::ServerLoad;
@@ -32,11 +33,14 @@ const LOAD_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Ends assignments that were not done in time.
 pub(super) async fn expire_assignments(app: App) {
-    let mut ticks = ticks(EXPIRY_INTERVAL);
-    while next_tick(&mut ticks, &app.stop).await {
+    let mut ticks = SharedTicks::new(EXPIRY_INTERVAL, &app);
+    while ticks.next(&app.stop).await {
         match app.actions.expire().await {
             // Clients reconnect with a valid token, if they have one.
-            Ok(users) => users.iter().for_each(|user| app.broker.disconnect_person(user)),
+            Ok(users) => users.iter().for_each(|user| {
+                app.broker.disconnect_person(user);
+                app.changes.end_person_elsewhere(user);
+            }),
             Err(error) => error.log("expired assignments could not be processed"),
         }
     }
@@ -45,12 +49,12 @@ pub(super) async fn expire_assignments(app: App) {
 /// Advances rollouts when robots come online or stay away. Changes by a report or an order advance
 /// rollouts directly.
 pub(super) async fn advance_rollouts(app: App) {
-    let mut ticks = ticks(ROLLOUT_INTERVAL);
+    let mut ticks = SharedTicks::new(ROLLOUT_INTERVAL, &app);
     let mut fleet_events = app.changes.fleet_events();
     while !app.stop.is_cancelled() {
         tokio::select! {
             () = app.stop.cancelled() => return,
-            _ = ticks.tick() => {}
+            _ = ticks.next(&app.stop) => {}
             () = robot_connected(&mut fleet_events) => {}
         }
         if let Err(error) = app.actions.deployments.advance_rollouts().await {
@@ -122,9 +126,35 @@ pub(super) async fn announce_silent_robots(app: App) {
         let now_ms = app.clock.now_ms();
         for robot in app.presence.timed_out(since_ms, now_ms) {
             app.changes.announce_event(FleetEvent::Presence(robot.clone(), false));
-            app.changes.announce(Change::Robot(robot));
+            app.changes.announce_here(Change::Robot(robot));
         }
         since_ms = now_ms;
+    }
+}
+
+/// Ticks for work that every server of a cluster does for all: rarer the more servers live, and not
+/// at the same time.
+struct SharedTicks {
+    interval: Duration,
+    ticks: Interval,
+    nodes: LiveNodes,
+}
+
+impl SharedTicks {
+    /// The first tick comes at once, and the others at this interval if the server is alone.
+    fn new(interval: Duration, app: &App) -> Self {
+        Self { interval, ticks: ticks(interval), nodes: app.nodes.clone() }
+    }
+
+    /// Waits for the next tick; false when it is time to stop. Dropping the future loses none.
+    async fn next(&mut self, stop: &CancellationToken) -> bool {
+        let is_due = next_tick(&mut self.ticks, stop).await;
+        let nodes = self.nodes.count();
+        if nodes > 1 {
+            let share = self.interval.mul_f64(nodes as f64 * rand::random_range(0.75..1.25));
+            self.ticks.reset_after(share);
+        }
+        is_due
     }
 }
 

@@ -2,10 +2,12 @@
 //! loses nothing; it never decides what a part could decide.
 
 mod blobs;
+mod cluster;
 pub mod command_line;
 pub mod database;
 mod jobs;
 pub mod log_limits;
+mod part_settings;
 mod standby;
 
 use std::net::SocketAddr;
@@ -26,17 +28,20 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use self::blobs::open_blobs;
+use self::cluster::{new_changes, new_presence, start_cluster};
 use self::database::{Database, FirstOperator, check_periodically};
 use self::jobs::{
     advance_rollouts, announce_silent_robots, announce_violations, expire_assignments, sample_load,
 };
+use self::part_settings::{action_settings, tls_settings};
 use crate::auth::oidc::{OidcSetupError, Provider};
 use crate::blobs::collector;
 use crate::blobs::{BlobError, CommonStoreError};
 use crate::broker::{
     Broker, BrokerConfig, BrokerError, ExternalConfig, Gatekeeper, Health, Inbox, Limits,
 };
-use crate::config::{Config, TlsSettings};
+use crate::cluster::leave;
+use crate::config::Config;
 use crate::domain::limits::robot_limiter::RobotLimiter;
 use crate::fleet::presence::Presence;
 use crate::fleet::requests::Requests;
@@ -61,13 +66,13 @@ use crate::net::backlog::listen;
 use crate::net::http_connections::HttpConnections;
 use crate::net::proxy_protocol::ProxyProtocol;
 use crate::net::tls::{Tls, TlsError};
-use crate::orders::actions::{ActionSettings, Actions};
+use crate::orders::actions::Actions;
 use crate::orders::changes::Changes;
 use crate::orders::delivery_planner::{DeliveryPlanner, ServerLoad};
 use crate::orders::desired_states::DesiredStates;
 use crate::orders::feed::{self, FeedSource};
 use crate::orders::report_writer::ReportWriter;
-use crate::store::{ServerIdentity, Store, StoreError, sqlite_url};
+use crate::store::{ServerIdentity, Sharing, Store, StoreError, sqlite_url};
 use crate::system::clock::Clock;
 use crate::system::data_directory::{DataDirectory, DataError};
 use crate::system::host::host_name;
@@ -155,15 +160,12 @@ impl Server {
         let data = DataDirectory::open(&config.data)?;
         let key = Arc::new(data.signing_key()?);
         let public_key = key.public_key();
-        let tls = config
-            .encrypts()
-            .then(|| Tls::open(tls_settings(&config), &data, clock.clone()))
-            .transpose()?;
+        let tls = open_tls(&config, &data, &clock)?;
         let (stop, tasks) = (CancellationToken::new(), TaskTracker::new());
         if let Some(tls) = tls.clone() {
             tasks.spawn(tls.keep_current(stop.clone()));
         }
-        let presence = Arc::new(Presence::new(millis(config.presence_timeout), clock.now_ms()));
+        let (nodes, presence) = new_presence(&config, clock.now_ms());
         let store = open_store(&config, &data, &public_key).await?;
         let listening = standby::wait(&config, &data, &store, tls.as_ref()).await?;
         let database = open_database(store, &data, presence.clone(), clock.clone()).await?;
@@ -171,7 +173,7 @@ impl Server {
         let blobs = open_blobs(&config, &data, &store).await?;
         let (http, http_address) = listening.map_or_else(|| listen_for_http(config.http), Ok)?;
 
-        let changes = Changes::new();
+        let (changes, outbox) = new_changes(&config);
         let (load, http_connections) =
             (Arc::<ServerLoad>::default(), Arc::<HttpConnections>::default());
         let planner = DeliveryPlanner::new(&config.delivery, presence.clone(), load.clone());
@@ -222,11 +224,12 @@ impl Server {
             people: Arc::new(PersonLimits::new(config.people)),
             data: data.path().to_owned(),
             readiness: readiness.clone(),
+            nodes,
             stop: stop.clone(),
         });
         start_readiness(&tasks, &app).await;
-        start_tasks(&tasks, &app, &config);
-        tasks.spawn(sample_load(app.clone(), load));
+        start_cluster(&tasks, &app, &config, outbox, load.clone()).await;
+        start_tasks(&tasks, &app, &config, load);
         tasks.spawn(database.supervise(stop.clone()));
         let http = serve_http(http, app, tls.clone(), &config);
         let addresses = addresses(http_address, &broker, tls.as_ref().map(Tls::pin));
@@ -315,10 +318,19 @@ impl Server {
         if tokio::time::timeout(WRITER_TIMEOUT, drained).await.is_err() {
             tracing::warn!("some reports were not stored in time; robots send them again");
         }
+        if let Some(run) = self.store.cluster_run() {
+            // Without an answer, the others notice by themselves.
+            let _ = tokio::time::timeout(DATABASE_TIMEOUT, leave(&self.store, run)).await;
+        }
         if tokio::time::timeout(DATABASE_TIMEOUT, self.store.close()).await.is_err() {
             tracing::warn!("the database did not close in time");
         }
     }
+}
+
+/// The certificate of the listeners, if they encrypt.
+fn open_tls(config: &Config, data: &DataDirectory, clock: &Clock) -> Result<Option<Tls>, TlsError> {
+    config.encrypts().then(|| Tls::open(tls_settings(config), data, clock.clone())).transpose()
 }
 
 /// The parts that the traffic with robots and the HTTP API share.
@@ -431,7 +443,8 @@ fn serve_http(
 }
 
 /// Starts the tasks beside the listeners.
-fn start_tasks(tasks: &TaskTracker, app: &App, config: &Config) {
+fn start_tasks(tasks: &TaskTracker, app: &App, config: &Config, load: Arc<ServerLoad>) {
+    tasks.spawn(sample_load(app.clone(), load));
     let downlink = Downlink {
         desired_states: app.desired_states.clone(),
         blobs: app.blobs.clone(),
@@ -450,13 +463,17 @@ fn start_tasks(tasks: &TaskTracker, app: &App, config: &Config) {
         config.database_check_interval,
         stop.clone(),
     ));
-    tasks.spawn(collector::run(store, blobs, clock, config.blob_grace, stop));
+    let nodes = app.nodes.clone();
+    let pace = move || u32::try_from(nodes.count()).unwrap_or(1);
+    tasks.spawn(collector::run(store, blobs, clock, config.blob_grace, pace, stop));
     tasks.spawn(expire_assignments(app.clone()));
     let worker = FanOutWorker {
         store: app.store.clone(),
         deployments: app.actions.deployments.clone(),
         blobs: app.blobs.clone(),
         broker: app.broker.clone(),
+        presence: app.presence.clone(),
+        clock: app.clock.clone(),
         changes: app.changes.clone(),
         settings: config.delivery.clone(),
     };
@@ -503,6 +520,7 @@ async fn open_store(
         run: format!("{host}-{:016x}", rand::random::<u64>()),
         key_id: key.id(),
         topic_prefix: config.topic_prefix.as_str().to_owned(),
+        sharing: if config.cluster.is_some() { Sharing::Cluster } else { Sharing::Alone },
     };
     Ok(Store::guarded(&url, identity))
 }
@@ -535,24 +553,6 @@ fn publish(data: &DataDirectory, addresses: &Addresses) -> Result<(), DataError>
         }
         published => published,
     }
-}
-
-fn action_settings(config: &Config, tls: Option<&Tls>) -> ActionSettings {
-    ActionSettings {
-        ca_pin: tls.and_then(Tls::announced_pin),
-        assignment_lifetime_ms: millis(config.assignment_expiry),
-        enrollment_approval: config.enrollment_approval,
-        enrollment_token_uses: config.enrollment_uses,
-        enrollments_per_minute: config.enrollment_per_minute,
-        ..ActionSettings::default()
-    }
-}
-
-/// Adds the public host of robots to the certificate's names.
-fn tls_settings(config: &Config) -> TlsSettings {
-    let mut settings = config.tls.clone();
-    settings.names.extend(config.public_mqtt_host.clone());
-    settings
 }
 
 fn http_limits(config: &Config) -> listener::Limits {

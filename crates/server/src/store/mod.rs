@@ -26,8 +26,10 @@ use std::sync::Arc;
 
 use sqlx::Connection as _;
 use task_proto::RobotId;
+use tokio::sync::watch;
 
 pub use cluster::nodes::{NewNode, Node, NodeLoad};
+pub use cluster::notifications::NotificationListener;
 pub use cluster::robot_sessions::{
     LeftSession, NewRobotSession, RobotSession, SessionNode, SessionPosition,
 };
@@ -36,7 +38,7 @@ use database::connections::{ConnectionPool, PooledConnection, Statement};
 pub use database::copy::{CopyError, copy_database};
 pub use database::fault::Fault;
 use database::guard::{Guard, LAST_TURN, NEXT_TURN, holder};
-pub use database::guard::{Holder, LockAttempt, ServerIdentity, lock_holder};
+pub use database::guard::{Holder, LockAttempt, ServerIdentity, Sharing, lock_holder};
 pub use database::integrity::check_at_rest;
 use database::integrity::{Checked, check_quickly, postgres_page_protection};
 use database::primary::NewConnection;
@@ -193,6 +195,25 @@ pub enum StoreError {
         url: String,
         holder: Holder,
     },
+    /// The servers of a cluster hold the database's lock, and this server is in none.
+    #[error(
+        "database {url} is in use by a cluster of servers: make this server a part of it with [cluster], \
+         or stop the others; see docs/cluster.md"
+    )]
+    InUseByCluster {
+        /// The database, without its password.
+        url: String,
+    },
+    /// A server without a cluster holds the database's lock, and this server is in one.
+    #[error(
+        "database {url} is in use by {holder}, which is in no cluster: give that server [cluster] too, or stop it; \
+         see docs/cluster.md"
+    )]
+    InUseAlone {
+        /// The database, without its password.
+        url: String,
+        holder: Holder,
+    },
     /// Another server has become the holder, so this one may not write any more.
     #[error("{successor} has taken over the database; this server has stopped writing to it")]
     TakenOver { successor: Holder },
@@ -209,7 +230,7 @@ pub enum StoreError {
     },
     /// Robots would miss the messages of this server.
     #[error(
-        "topic_prefix is {own} here and {fleet} on the server that holds the database: a standby needs the same"
+        "topic_prefix is {own} here and {fleet} on the servers that use the database: this server needs the same"
     )]
     ForeignPrefix { own: String, fleet: String },
     /// The database was found corrupt while it was in use.
@@ -476,6 +497,31 @@ impl Store {
         if let Some(guard) = &self.guard {
             guard.release().await;
         }
+    }
+
+    /// The name of this start of the server, if it is in a cluster.
+    pub fn cluster_run(&self) -> Option<&str> {
+        self.guard.as_ref().filter(|guard| guard.is_shared()).map(Guard::run)
+    }
+
+    /// The number of connections to the database that were lost so far.
+    pub fn lost_connections(&self) -> u64 {
+        self.state.losses()
+    }
+
+    /// Forgets all cached admissions, because another server may have changed them.
+    pub fn forget_admissions(&self) {
+        self.auth_cache.forget();
+    }
+
+    /// Changes each time that a write of this server may have changed admissions.
+    pub fn changed_admissions(&self) -> watch::Receiver<()> {
+        self.auth_cache.changed()
+    }
+
+    /// Records that another server has taken this one's place, so that this one has to end.
+    pub fn record_takeover(&self, successor: &str) {
+        self.state.record_takeover(&successor);
     }
 
     /// Whether the database answers.

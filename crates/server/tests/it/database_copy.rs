@@ -7,7 +7,7 @@ use reqwest::StatusCode;
 use serde_json::{Value, json};
 use task_proto::messages::report::Phase;
 use taskd::config::Config;
-use taskd::store::{CopyError, ServerIdentity, Store, copy_database, sqlite_url};
+use taskd::store::{CopyError, ServerIdentity, Sharing, Store, copy_database, sqlite_url};
 use tempfile::TempDir;
 
 use crate::cli::{Ran, command, run};
@@ -205,6 +205,7 @@ async fn copy_to_a_used_database_is_refused() {
         run: "rack-1".to_owned(),
         key_id: "key".to_owned(),
         topic_prefix: "taskd/v1".to_owned(),
+        sharing: Sharing::Alone,
     };
     let server = Store::guarded(&postgres.url, identity);
     server.prepare().await.expect("prepared");

@@ -10,7 +10,7 @@ use task_proto::RobotId;
 use task_proto::trust::token::{Token, TokenKind};
 use taskd::fleet::presence::Presence;
 use taskd::serve::database::{Database, FirstOperator};
-use taskd::store::{LockAttempt, ServerIdentity, Store, StoreError, lock_holder};
+use taskd::store::{LockAttempt, ServerIdentity, Sharing, Store, StoreError, lock_holder};
 use taskd::system::clock::Clock;
 
 use crate::database::{self, TestDatabase};
@@ -22,6 +22,7 @@ fn identity(run: &str) -> ServerIdentity {
         run: run.to_owned(),
         key_id: "key".to_owned(),
         topic_prefix: "taskd/v1".to_owned(),
+        sharing: Sharing::Alone,
     }
 }
 

@@ -102,7 +102,7 @@ impl Inbox for TestInbox {
             Ok(())
         })
     }
-    fn connected(&self, robot: &RobotId, _peer: Option<SocketAddr>, connection: u64) {
+    fn connected(&self, robot: &RobotId, _: Option<SocketAddr>, connection: u64, _: Option<u64>) {
         let _ = self.seen.send(Seen::Connected(robot.clone(), connection));
     }
     fn disconnected(&self, robot: &RobotId, connection: u64) {

@@ -302,7 +302,7 @@ impl<'a> Session<'a> {
             self.external.inbox.disconnected(robot, number);
         }
         if let Some(number) = change.begun {
-            self.external.inbox.connected(robot, UNKNOWN, number);
+            self.external.inbox.connected(robot, UNKNOWN, number, None);
         }
     }
 

@@ -133,6 +133,18 @@ impl Front {
         self.context.slots.evict(robot);
     }
 
+    pub(super) fn disconnect_other_tokens(&self, robot: &RobotId, kept: u64) {
+        self.context.slots.evict_other_tokens(robot, kept);
+    }
+
+    pub(super) fn disconnect_session(&self, robot: &RobotId, connection: u64) {
+        self.context.slots.evict_session(robot, connection);
+    }
+
+    pub(super) fn disconnect_people(&self) {
+        self.context.slots.evict_people();
+    }
+
     pub(super) fn disconnect_person(&self, user: &UserName) {
         self.context.slots.evict_person(user);
     }

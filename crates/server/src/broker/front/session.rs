@@ -130,7 +130,12 @@ where
     let authenticated = authenticate(context, stream, pending).await?;
     let unavailable =
         |reason| Rejection::Answered { code: ConnectReturnCode::ServiceUnavailable, reason };
-    let slot = context.slots.take(authenticated.slot_key.clone(), meter.clone()).await;
+    let token_number = match authenticated.client {
+        Client::Robot { token_number, .. } => Some(token_number),
+        Client::Operator(_) | Client::Canary => None,
+    };
+    let key = authenticated.slot_key.clone();
+    let slot = context.slots.take(key, token_number, meter.clone()).await;
     let slot = slot.ok_or(unavailable("the person has the maximum number of sessions"))?;
     authenticated.recheck(context).await?;
     let topics = match authenticated.client {

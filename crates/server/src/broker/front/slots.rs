@@ -53,6 +53,8 @@ struct Table {
 
 struct ActiveSession {
     number: u64,
+    /// The token that admitted a robot's session.
+    token_number: Option<u64>,
     evicted: CancellationToken,
     ended: CancellationToken,
     mailbox: Arc<RobotMailbox>,
@@ -79,9 +81,10 @@ impl SessionSlots {
     pub(super) async fn take(
         self: &Arc<Self>,
         name: SlotKey,
+        token_number: Option<u64>,
         meter: Arc<Meter>,
     ) -> Option<SessionSlot> {
-        let (slot, before) = self.register(name, meter)?;
+        let (slot, before) = self.register(name, token_number, meter)?;
         if let Some(before) = before {
             before.evicted.cancel();
             before.ended.cancelled().await;
@@ -92,6 +95,7 @@ impl SessionSlots {
     fn register(
         self: &Arc<Self>,
         name: SlotKey,
+        token_number: Option<u64>,
         meter: Arc<Meter>,
     ) -> Option<(SessionSlot, Option<Arc<ActiveSession>>)> {
         let mut table = self.table();
@@ -103,6 +107,7 @@ impl SessionSlots {
         table.last_number += 1;
         let session = Arc::new(ActiveSession {
             number: table.last_number,
+            token_number,
             evicted: CancellationToken::new(),
             ended: CancellationToken::new(),
             mailbox: Arc::new(RobotMailbox::default()),
@@ -152,6 +157,25 @@ impl SessionSlots {
         }
     }
 
+    /// Evicts the robot's session unless the token `kept` has admitted it.
+    pub(super) fn evict_other_tokens(&self, robot: &RobotId, kept: u64) {
+        self.evictions.fetch_add(1, Ordering::SeqCst);
+        if let Some(session) = self.table().sessions.get(&SlotKey::Robot(robot.clone()))
+            && session.token_number != Some(kept)
+        {
+            session.evicted.cancel();
+        }
+    }
+
+    /// Evicts the robot's session with this number.
+    pub(super) fn evict_session(&self, robot: &RobotId, number: u64) {
+        if let Some(session) = self.table().sessions.get(&SlotKey::Robot(robot.clone()))
+            && session.number == number
+        {
+            session.evicted.cancel();
+        }
+    }
+
     /// The robots with a slot.
     pub(super) fn robots(&self) -> Vec<RobotId> {
         let robot = |name: &SlotKey| match name {
@@ -165,6 +189,15 @@ impl SessionSlots {
     pub(super) fn evict_person(&self, person: &UserName) {
         for (name, session) in &self.table().sessions {
             if name.person() == Some(person) {
+                session.evicted.cancel();
+            }
+        }
+    }
+
+    /// Evicts the sessions of all people.
+    pub(super) fn evict_people(&self) {
+        for (name, session) in &self.table().sessions {
+            if name.person().is_some() {
                 session.evicted.cancel();
             }
         }
@@ -269,7 +302,7 @@ mod tests {
         let slots = SessionSlots::new(2);
         let [alice, bob]: [UserName; 2] =
             ["alice", "bob"].map(|name| name.parse().expect("a name"));
-        let take = async |name: SlotKey| slots.take(name, Arc::default()).await;
+        let take = async |name: SlotKey| slots.take(name, None, Arc::default()).await;
         let named = SlotKey::Operator(alice.clone(), "one".to_owned());
         let first = take(named.clone()).await.expect("room");
         let second = take(SlotKey::Unnamed(alice.clone(), 1)).await.expect("room");

@@ -2,4 +2,5 @@
 
 pub(super) mod oidc;
 pub(super) mod people;
+pub(super) mod person_sessions;
 pub mod session;

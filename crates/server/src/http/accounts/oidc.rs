@@ -13,9 +13,9 @@ use task_macros::operation;
 use task_proto::UserName;
 use utoipa::IntoParams;
 
+use super::person_sessions::PersonSessions;
 use super::session::{PageCookies, PageSignIn};
 use crate::auth::oidc::{OidcError, Provider, SignInAttempt};
-use crate::broker::Broker;
 use crate::http::auth::cookie;
 use crate::http::error::ApiError;
 use crate::http::extract::QueryParams;
@@ -63,14 +63,14 @@ pub(in crate::http) struct AuthorizationResponse {
 pub(in crate::http) async fn finish(
     State(page): State<PageSignIn>,
     State(people): State<PersonActions>,
-    State(broker): State<Broker>,
+    State(sessions): State<PersonSessions>,
     ConnectInfo(peer): ConnectInfo<SocketAddr>,
     headers: HeaderMap,
     QueryParams(answer): QueryParams<AuthorizationResponse>,
 ) -> Result<Response, ApiError> {
     let (provider, cookies) = (configured_provider(&page)?, page.cookies);
     let address = peer.ip().to_canonical();
-    let signed_in = sign_in(&page, &people, &broker, provider, &headers, answer, address).await;
+    let signed_in = sign_in(&page, &people, &sessions, provider, &headers, answer, address).await;
     Ok(match signed_in {
         Ok(session) => redirect("/", &[sign_in_cookie(cookies, "", 0), session]),
         Err(code) => redirect_with_problem(cookies, code),
@@ -85,7 +85,7 @@ fn configured_provider(page: &PageSignIn) -> Result<&Provider, ApiError> {
 async fn sign_in(
     page: &PageSignIn,
     people: &PersonActions,
-    broker: &Broker,
+    sessions: &PersonSessions,
     provider: &Provider,
     headers: &HeaderMap,
     answer: AuthorizationResponse,
@@ -100,7 +100,7 @@ async fn sign_in(
     let attempt = attempt.filter(is_own).ok_or("expired")?;
     // Counted only after this check: otherwise a foreign page could get its visitors' address
     // blocked.
-    people.begin_provider_sign_in(address).await.map_err(|error| refusal_code(broker, error))?;
+    people.begin_provider_sign_in(address).await.map_err(|error| refusal_code(sessions, error))?;
     if answer.iss.is_some_and(|issuer| issuer != provider.settings().issuer) {
         return Err(provider_failure(&OidcError::Unusable {
             resource: "answer",
@@ -124,13 +124,13 @@ async fn sign_in(
     };
     let signed_in =
         people.sign_in_through_provider(&user, provider.rule_for(&claims), address).await;
-    let signed_in = signed_in.map_err(|error| refusal_code(broker, error))?;
+    let signed_in = signed_in.map_err(|error| refusal_code(sessions, error))?;
     if signed_in.rights_changed {
-        broker.disconnect_person(&signed_in.user);
+        sessions.end(&signed_in.user);
     }
     people.provider_sign_in_succeeded(address);
     let cookie = page.begin_session(headers, &signed_in.token, &signed_in.user, now_ms).await;
-    cookie.map_err(|error| refusal_code(broker, error.into()))
+    cookie.map_err(|error| refusal_code(sessions, error.into()))
 }
 
 fn provider_failure(error: &OidcError) -> &'static str {
@@ -138,9 +138,9 @@ fn provider_failure(error: &OidcError) -> &'static str {
     "failed"
 }
 
-fn refusal_code(broker: &Broker, error: PersonError) -> &'static str {
+fn refusal_code(sessions: &PersonSessions, error: PersonError) -> &'static str {
     if let PersonError::NoRole { removed: Some(user) } = &error {
-        broker.disconnect_person(user);
+        sessions.end(user);
     }
     match error {
         PersonError::SignInBlocked { .. } => "blocked",

@@ -16,7 +16,7 @@ use task_proto::people::roles::Permission;
 use task_proto::{TokenId, UserName};
 use utoipa::IntoParams;
 
-use crate::broker::Broker;
+use super::person_sessions::PersonSessions;
 use crate::domain::person::Person;
 use crate::http::auth::not_permitted;
 use crate::http::error::ApiError;
@@ -57,13 +57,13 @@ pub(in crate::http) async fn add_user(
     responses((status = 409, description = "`last_administrator`, or `of_provider`: the OpenID provider determines the user's permissions.")))]
 pub(in crate::http) async fn edit_user(
     State(people): State<PersonActions>,
-    State(broker): State<Broker>,
+    State(sessions): State<PersonSessions>,
     by: Person,
     PathParam(user): PathParam<UserName>,
     JsonBody(edit): JsonBody<EditUser>,
 ) -> Result<Json<UserView>, ApiError> {
     let view = people.edit_user(&by, &user, &edit).await?;
-    broker.disconnect_person(&user);
+    sessions.end(&user);
     Ok(Json(view))
 }
 
@@ -72,12 +72,12 @@ pub(in crate::http) async fn edit_user(
     responses((status = 409, description = "`last_administrator`: one administrator must remain.")))]
 pub(in crate::http) async fn remove_user(
     State(people): State<PersonActions>,
-    State(broker): State<Broker>,
+    State(sessions): State<PersonSessions>,
     by: Person,
     PathParam(user): PathParam<UserName>,
 ) -> Result<NoContent, ApiError> {
     people.remove_user(&by, &user).await?;
-    broker.disconnect_person(&user);
+    sessions.end(&user);
     Ok(NoContent)
 }
 
@@ -86,13 +86,13 @@ pub(in crate::http) async fn remove_user(
     responses((status = 409, description = "`of_provider`: users who sign in by the OpenID provider have no password here.")))]
 pub(in crate::http) async fn set_password(
     State(people): State<PersonActions>,
-    State(broker): State<Broker>,
+    State(sessions): State<PersonSessions>,
     by: Person,
     PathParam(user): PathParam<UserName>,
     JsonBody(order): JsonBody<SetPassword>,
 ) -> Result<NoContent, ApiError> {
     people.set_password(&by, &user, &order.password).await?;
-    broker.disconnect_person(&user);
+    sessions.end(&user);
     Ok(NoContent)
 }
 
@@ -102,12 +102,12 @@ pub(in crate::http) async fn set_password(
         (status = 429, description = "The old password was wrong too often.")))]
 pub(in crate::http) async fn change_password(
     State(people): State<PersonActions>,
-    State(broker): State<Broker>,
+    State(sessions): State<PersonSessions>,
     by: Person,
     JsonBody(order): JsonBody<ChangePassword>,
 ) -> Result<NoContent, ApiError> {
     people.change_password(&by, &order).await?;
-    broker.disconnect_person(&by.name);
+    sessions.end(&by.name);
     Ok(NoContent)
 }
 
@@ -163,12 +163,12 @@ pub(in crate::http) async fn create_token(
 #[operation(tag = "people")]
 pub(in crate::http) async fn revoke_token(
     State(people): State<PersonActions>,
-    State(broker): State<Broker>,
+    State(sessions): State<PersonSessions>,
     by: Person,
     PathParam(token): PathParam<TokenId>,
 ) -> Result<NoContent, ApiError> {
     let user = people.revoke_token(&by, &token).await?;
-    broker.disconnect_person(&user);
+    sessions.end(&user);
     Ok(NoContent)
 }
 

@@ -14,8 +14,8 @@ use task_proto::api::{LogIn, ProviderView, SessionView, SignIn, TokenOrigin};
 use task_proto::trust::token::Token;
 use task_proto::{Digest, UserName};
 
+use super::person_sessions::PersonSessions;
 use crate::auth::oidc::Provider;
-use crate::broker::Broker;
 use crate::domain::person::Person;
 use crate::http::auth::{COOKIE, require_same_origin, session_digest};
 use crate::http::error::ApiError;
@@ -153,12 +153,12 @@ pub(in crate::http) async fn show(
 pub(in crate::http) async fn sign_out(
     State(page): State<PageSignIn>,
     State(people): State<PersonActions>,
-    State(broker): State<Broker>,
+    State(sessions): State<PersonSessions>,
     by: Person,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
     people.sign_out(&by, session_digest(&headers).as_ref()).await?;
-    broker.disconnect_person(&by.name);
+    sessions.end(&by.name);
     let cookie = (header::SET_COOKIE, page.cookies.set(COOKIE, "", COOKIE_ATTRIBUTES, 0));
     // The browser's cache must not be available to its next user.
     let forget = (HeaderName::from_static("clear-site-data"), "\"cache\"".to_owned());

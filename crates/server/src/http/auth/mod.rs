@@ -450,7 +450,7 @@ async fn authenticate(
         {
             connection.authenticate();
         }
-        if let TokenHolder::Robot { robot, .. } = &holder
+        if let TokenHolder::Robot { robot, token_number, .. } = &holder
             && is_first_use
         {
             // Existing connections used the token that has just ended. This request's own
@@ -459,7 +459,8 @@ async fn authenticate(
             if let Some(connection) = connection {
                 connection.release();
             }
-            announce_new_token(&app.presence, &app.http_connections, &app.changes, robot);
+            let (presence, connections) = (&app.presence, &app.http_connections);
+            announce_new_token(presence, connections, &app.changes, robot, *token_number);
         }
         Ok(Some(holder))
     });

@@ -65,7 +65,8 @@ impl LiveRobots {
 
     /// The robot's MQTT session, if the robot has one.
     pub(super) fn mqtt_connection(&self, robot: &RobotId) -> Option<MqttConnection> {
-        let since_ms = self.presence.get(robot, self.clock.now_ms())?.connected_since_ms?;
+        let presence = self.presence.get(robot, self.clock.now_ms())?;
+        let since_ms = presence.connected_since_ms.filter(|_| presence.connection.is_some())?;
         let traffic = self.broker.traffic_of(robot)?;
         Some(MqttConnection { since_ms, traffic })
     }
@@ -94,7 +95,7 @@ impl LiveRobots {
     /// result is what was recorded.
     pub(super) fn record_vitals(&self, robot: RobotId, reported: Vitals) -> Vitals {
         let recorded = self.vitals.record(&robot, reported, self.clock.now_ms());
-        self.changes.announce(Change::Robot(robot));
+        self.changes.announce_here(Change::Robot(robot));
         recorded
     }
 
@@ -125,5 +126,6 @@ impl LiveRobots {
     fn disconnect(&self, robot: &RobotId) {
         self.broker.disconnect(robot);
         self.http_connections.end(robot);
+        self.changes.end_robot_elsewhere(robot, None);
     }
 }

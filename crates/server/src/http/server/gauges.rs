@@ -12,6 +12,7 @@ use super::server_facts::ServerFacts;
 use crate::blobs::Blobs;
 use crate::broker::Broker;
 use crate::domain::limits::robot_limiter::RobotLimiter;
+use crate::fleet::live_nodes::LiveNodes;
 use crate::fleet::presence::Presence;
 use crate::http::connection::traffic::HttpTotals;
 use crate::http::error::ApiError;
@@ -32,6 +33,7 @@ pub struct Gauges {
     pub(in crate::http) slow_figures: Arc<SlowFigures>,
     pub(in crate::http) reports: ReportWriter,
     pub(in crate::http) transfers: Transfers,
+    pub(in crate::http) nodes: LiveNodes,
     pub(in crate::http) presence: Arc<Presence>,
     pub(in crate::http) broker: Broker,
     pub(in crate::http) http_traffic: Arc<HttpTotals>,

@@ -65,7 +65,7 @@ pub(in crate::http) async fn status(
             kind: database.kind.to_owned(),
             size_bytes: database.bytes,
             latency_ms,
-            problem: state.problem(),
+            problem: state.problem().or_else(|| gauges.nodes.bus_problem()),
             fully_checked_at_ms: state.fully_checked_at_ms(),
             guard: state.page_protection().map(str::to_owned),
         },

@@ -21,9 +21,11 @@ use tokio_util::sync::CancellationToken;
 use crate::blobs::Blobs;
 use crate::broker::Broker;
 use crate::config::DeliverySettings;
+use crate::fleet::presence::Presence;
 use crate::orders::actions::DeploymentActions;
 use crate::orders::changes::{Change, Changes};
 use crate::store::{Store, StoreError};
+use crate::system::clock::Clock;
 
 /// Maximum packages in fan-out at the same time; the broker permits no more.
 const MAX_AT_ONCE: usize = 4;
@@ -44,6 +46,9 @@ pub struct FanOutWorker {
     /// The bytes of packages.
     pub blobs: Blobs,
     pub broker: Broker,
+    /// Where robots are: those at other servers get their parts there.
+    pub presence: Arc<Presence>,
+    pub clock: Clock,
     /// Changes of orders, and robots' missing parts.
     pub changes: Changes,
     /// Part size and quality of service.
@@ -107,6 +112,9 @@ impl FanOutWorker {
     async fn pending_contents(&self) -> Result<Vec<PendingContent>, StoreError> {
         let mut pending: Vec<PendingContent> = Vec::new();
         for (deployment, package) in self.store.fan_outs().list().await? {
+            if !self.has_robots_of(&package.content.digest).await? {
+                continue;
+            }
             match pending.iter_mut().find(|other| other.content == package.content) {
                 Some(other) => other.deployments.push(deployment),
                 None => pending.push(PendingContent {
@@ -116,6 +124,16 @@ impl FanOutWorker {
             }
         }
         Ok(pending)
+    }
+
+    /// Whether a robot that waits for the content is not at another server.
+    async fn has_robots_of(&self, content: &Digest) -> Result<bool, StoreError> {
+        if self.presence.shared().is_none() {
+            return Ok(true);
+        }
+        let waiting = self.store.fan_outs().awaiting_parts(content).await?;
+        let now_ms = self.clock.now_ms();
+        Ok(waiting.iter().any(|(_, robot)| !self.presence.is_elsewhere(robot, now_ms)))
     }
 
     fn begin(&self, pending: Vec<PendingContent>, active: &mut ActiveFanOuts) {

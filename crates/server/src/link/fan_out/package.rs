@@ -217,7 +217,9 @@ impl Package<'_> {
         for (deployment, robot) in
             self.worker.store.fan_outs().awaiting_parts(&self.content.digest).await?
         {
-            self.owners.entry(robot).or_default().push(deployment);
+            if !self.worker.presence.is_elsewhere(&robot, self.worker.clock.now_ms()) {
+                self.owners.entry(robot).or_default().push(deployment);
+            }
         }
         let robots: BTreeSet<RobotId> = self.owners.keys().cloned().collect();
         let (new, gone) = self.state.set_robots(&robots, now_ms);

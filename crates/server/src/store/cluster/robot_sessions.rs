@@ -174,22 +174,34 @@ impl RobotSessions<&Store> {
         rows.iter().map(robot).collect()
     }
 
-    /// The sessions of a run that were stored after `position`, in their order, and at most some
-    /// thousand.
+    /// The sessions of runs that were stored after these positions, in the order of their changes.
+    /// Of many, only the first; true: there are more.
     pub async fn changed(
         self,
-        position: &SessionPosition,
-    ) -> Result<Vec<RobotSession>, StoreError> {
-        let rows = sqlx::query(
-            "SELECT robot_id, run, epoch, change, since_ms, seen_ms, left_ms, address
-             FROM robot_sessions WHERE run = $1 AND change > $2 ORDER BY change LIMIT $3",
-        )
-        .bind(position.run.as_str())
-        .bind(stored(position.change))
-        .bind(MAX_CHANGED)
-        .fetch_all(&self.0.reads)
-        .await?;
-        rows.iter().map(session).collect()
+        positions: &[SessionPosition],
+    ) -> Result<(Vec<RobotSession>, bool), StoreError> {
+        if positions.is_empty() {
+            return Ok((Vec::new(), false));
+        }
+        let sql = format!(
+            "WITH p (run, change) AS ({})
+             SELECT s.robot_id, s.run, s.epoch, s.change, s.since_ms, s.seen_ms, s.left_ms, s.address
+             FROM p JOIN robot_sessions s ON s.run = p.run AND s.change > p.change
+             ORDER BY s.change LIMIT $1",
+            values(2, positions.len(), &["TEXT", "BIGINT"])
+        );
+        let mut query = sqlx::query(AssertSqlSafe(sql)).bind(MAX_CHANGED);
+        for position in positions {
+            query = query.bind(position.run.as_str()).bind(stored(position.change));
+        }
+        let rows = query.fetch_all(&self.0.reads).await?;
+        let mut sessions = rows.iter().map(session).collect::<Result<Vec<_>, _>>()?;
+        let is_cut = sessions.len() as i64 == MAX_CHANGED;
+        if let Some(last) = sessions.last().map(|session| session.change).filter(|_| is_cut) {
+            // Rows of one statement have the same number, and the limit may have cut between them.
+            sessions.retain(|session| session.change < last);
+        }
+        Ok((sessions, is_cut))
     }
 
     /// The server that has the robot's session, if it is one of `live_runs`.

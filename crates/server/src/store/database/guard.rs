@@ -1,7 +1,7 @@
-//! Admits one server at a time to a Postgres database. An advisory lock, on a connection of its
-//! own, tells servers that run apart. The holder's name in the row that every write updates stops a
-//! server that does not know yet that it has lost the lock. SQLite needs neither, because its data
-//! directory is locked.
+//! Admits one server at a time to a Postgres database, or the servers of one cluster. An advisory
+//! lock, on a connection of its own, tells servers that run apart; the servers of a cluster share
+//! it. The holder's name in the row that every write updates stops a server that does not know yet
+//! that it has lost the lock. SQLite needs neither, because its data directory is locked.
 
 use std::fmt;
 use std::sync::{Arc, OnceLock};
@@ -44,6 +44,15 @@ const RETRY_INTERVAL: Duration = Duration::from_millis(500);
 /// which may be this machine before it was restarted.
 const MAX_ATTEMPTS: u32 = 16;
 
+/// How a server takes the database's lock.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Sharing {
+    /// For itself.
+    Alone,
+    /// Together with the other servers of its cluster.
+    Cluster,
+}
+
 /// One start of a server, and what it has in common with the other servers of its fleet.
 #[derive(Debug, Clone)]
 pub struct ServerIdentity {
@@ -53,6 +62,7 @@ pub struct ServerIdentity {
     pub key_id: String,
     /// The prefix of all MQTT topics.
     pub topic_prefix: String,
+    pub sharing: Sharing,
 }
 
 /// The server that may write to a database, as far as known.
@@ -60,10 +70,15 @@ pub struct ServerIdentity {
 pub struct Holder {
     run: Option<String>,
     since_ms: Option<u64>,
+    /// Whether the servers of a cluster share the lock.
+    is_cluster: bool,
 }
 
 impl fmt::Display for Holder {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if self.is_cluster {
+            return f.write_str("a cluster of servers");
+        }
         let Some(run) = &self.run else { return f.write_str("another server") };
         write!(f, "server {run}")?;
         match self.since_ms {
@@ -113,6 +128,11 @@ impl Guard {
         &self.lock.identity.run
     }
 
+    /// Whether the servers of a cluster share the lock.
+    pub(in crate::store) fn is_shared(&self) -> bool {
+        self.lock.identity.sharing == Sharing::Cluster
+    }
+
     /// Opens the lock's connection, if it is not open. Refuses a server with another signing key
     /// than the fleet's.
     pub(in crate::store) async fn connect(&self) -> Result<(), StoreError> {
@@ -132,8 +152,10 @@ impl Guard {
     /// robots this server is to take over.
     pub(in crate::store) async fn try_succeed(&self) -> Result<LockAttempt, StoreError> {
         let attempt = self.lock.try_take().await?;
-        if attempt != LockAttempt::Taken {
-            self.lock.check_prefix().await?;
+        match &attempt {
+            LockAttempt::Taken => {}
+            LockAttempt::Held(holder) if holder.is_cluster => return Err(self.in_use(holder)),
+            LockAttempt::Held(_) => self.lock.check_prefix().await?,
         }
         Ok(attempt)
     }
@@ -153,7 +175,17 @@ impl Guard {
             }
             tokio::time::sleep(RETRY_INTERVAL).await;
         }
-        Err(StoreError::InUse { url: without_password(&self.lock.url), holder })
+        Err(self.in_use(&holder))
+    }
+
+    /// The error that other servers have the lock.
+    fn in_use(&self, holder: &Holder) -> StoreError {
+        let (url, holder) = (without_password(&self.lock.url), holder.clone());
+        match (self.lock.identity.sharing, holder.is_cluster) {
+            (Sharing::Alone, false) => StoreError::InUse { url, holder },
+            (Sharing::Alone, true) => StoreError::InUseByCluster { url },
+            (Sharing::Cluster, _) => StoreError::InUseAlone { url, holder },
+        }
     }
 
     /// Makes this server the holder, so that only its writes are accepted, and keeps the lock from
@@ -197,12 +229,14 @@ impl Lock {
             None => self.connect().await?,
         };
         if !session.has_lock {
-            session.has_lock = bounded(ANSWER_TIMEOUT, try_lock(&mut session.connection)).await?;
+            let attempt = try_lock(&mut session.connection, self.identity.sharing);
+            session.has_lock = bounded(ANSWER_TIMEOUT, attempt).await?;
         }
         let attempt = match session.has_lock {
             true => LockAttempt::Taken,
             false => {
-                LockAttempt::Held(bounded(ANSWER_TIMEOUT, holder(&mut session.connection)).await?)
+                let holder = lock_users(&mut session.connection);
+                LockAttempt::Held(bounded(ANSWER_TIMEOUT, holder).await?.unwrap_or_default())
             }
         };
         *slot = Some(session);
@@ -225,11 +259,13 @@ impl Lock {
         let mut session = slot.take().ok_or_else(lost)?;
         let fleet = bounded(ANSWER_TIMEOUT, fleet(&mut session.connection)).await?;
         *slot = Some(session);
-        let own = &self.identity.topic_prefix;
-        match fleet {
-            Some(fleet) if fleet.topic_prefix != *own => {
-                Err(StoreError::ForeignPrefix { own: own.clone(), fleet: fleet.topic_prefix })
-            }
+        self.compare_prefix(fleet.as_ref())
+    }
+
+    fn compare_prefix(&self, fleet: Option<&Fleet>) -> Result<(), StoreError> {
+        let own = self.identity.topic_prefix.clone();
+        match fleet.map(|fleet| fleet.topic_prefix.clone()) {
+            Some(fleet) if fleet != own => Err(StoreError::ForeignPrefix { own, fleet }),
             _ => Ok(()),
         }
     }
@@ -241,8 +277,19 @@ impl Lock {
         };
         let connection = &mut session.connection;
         let fleet = bounded(ANSWER_TIMEOUT, join_fleet(connection, &self.identity)).await?;
-        self.check_key(fleet)?;
-        bounded(CLAIM_TIMEOUT, set_holder(connection, &self.identity.run)).await?;
+        match self.identity.sharing {
+            Sharing::Alone => {
+                self.check_key(fleet)?;
+                bounded(CLAIM_TIMEOUT, set_holder(connection, Some(&self.identity.run))).await?;
+            }
+            Sharing::Cluster => {
+                self.compare_prefix(fleet.as_ref())?;
+                self.check_key(fleet)?;
+                if bounded(ANSWER_TIMEOUT, holder(&mut *connection)).await?.run.is_some() {
+                    bounded(CLAIM_TIMEOUT, set_holder(connection, None)).await?;
+                }
+            }
+        }
         // Not before, because bringing the tables up to date may take longer.
         bounded(ANSWER_TIMEOUT, execute(connection, IDLE_TIMEOUT)).await?;
         *slot = Some(session);
@@ -282,6 +329,11 @@ impl Lock {
                 if holder.run.as_ref().is_some_and(|run| *run != self.identity.run) {
                     return Some(holder);
                 }
+                if let LockAttempt::Held(found) = &attempt
+                    && found.is_cluster
+                {
+                    return Some(found.clone());
+                }
                 if attempt == LockAttempt::Taken {
                     return None;
                 }
@@ -309,22 +361,28 @@ struct Fleet {
 
 /// The server that holds the lock of the Postgres database at `url`; `None`: no server does.
 pub async fn lock_holder(url: &str) -> Result<Option<Holder>, StoreError> {
-    const HELD: &str = "SELECT 1 FROM pg_locks
-        WHERE locktype = 'advisory' AND granted AND objsubid = 1
-        AND database = (SELECT oid FROM pg_database WHERE datname = current_database())
-        AND CAST(classid AS BIGINT) = $1 AND CAST(objid AS BIGINT) = $2";
     sqlx::any::install_default_drivers();
     let NewConnection { mut connection, .. } = first_connection(url)
         .await
         .map_err(|source| StoreError::Open { url: without_password(url), source })?;
-    let query = sqlx::query(HELD).bind(LOCK_KEY >> 32).bind(LOCK_KEY & 0xffff_ffff);
-    let held = bounded(ANSWER_TIMEOUT, query.fetch_optional(&mut connection)).await?;
-    let found = match held {
-        Some(_) => Some(bounded(ANSWER_TIMEOUT, holder(&mut connection)).await?),
-        None => None,
-    };
+    let found = bounded(ANSWER_TIMEOUT, lock_users(&mut connection)).await?;
     bounded(ANSWER_TIMEOUT, connection.close()).await?;
     Ok(found)
+}
+
+/// The server or the servers that hold the lock; `None`: it is free.
+async fn lock_users(connection: &mut AnyConnection) -> Result<Option<Holder>, Error> {
+    const MODE: &str = "SELECT mode FROM pg_locks
+        WHERE locktype = 'advisory' AND granted AND objsubid = 1
+        AND database = (SELECT oid FROM pg_database WHERE datname = current_database())
+        AND CAST(classid AS BIGINT) = $1 AND CAST(objid AS BIGINT) = $2 LIMIT 1";
+    let query = sqlx::query_scalar(MODE).bind(LOCK_KEY >> 32).bind(LOCK_KEY & 0xffff_ffff);
+    let mode: Option<String> = query.fetch_optional(&mut *connection).await?;
+    match mode.as_deref() {
+        None => Ok(None),
+        Some("ShareLock") => Ok(Some(Holder { is_cluster: true, ..Holder::default() })),
+        Some(_) => holder(connection).await.map(Some),
+    }
 }
 
 /// Takes the lock for the session of `connection`, which holds it until it is closed. If the lock
@@ -333,12 +391,13 @@ pub(in crate::store) async fn take_lock(
     connection: &mut AnyConnection,
 ) -> Result<Option<Holder>, Error> {
     for _ in 0..MAX_ATTEMPTS {
-        if bounded(ANSWER_TIMEOUT, try_lock(connection)).await? {
+        if bounded(ANSWER_TIMEOUT, try_lock(connection, Sharing::Alone)).await? {
             return Ok(None);
         }
         tokio::time::sleep(RETRY_INTERVAL).await;
     }
-    bounded(ANSWER_TIMEOUT, holder(connection)).await.map(Some)
+    let holder = bounded(ANSWER_TIMEOUT, lock_users(connection)).await?;
+    Ok(Some(holder.unwrap_or_default()))
 }
 
 /// The server that may write.
@@ -351,12 +410,15 @@ pub(in crate::store) async fn holder<'c>(
         Err(error) if is_missing(&error) => (None, None),
         found => found?.unwrap_or_default(),
     };
-    Ok(Holder { run, since_ms: since_ms.map(rows::number) })
+    Ok(Holder { run, since_ms: since_ms.map(rows::number), is_cluster: false })
 }
 
-async fn try_lock(connection: &mut AnyConnection) -> Result<bool, Error> {
-    let query = sqlx::query_scalar("SELECT CAST(pg_try_advisory_lock($1) AS INT)").bind(LOCK_KEY);
-    let locked: i32 = query.fetch_one(connection).await?;
+async fn try_lock(connection: &mut AnyConnection, sharing: Sharing) -> Result<bool, Error> {
+    let sql = match sharing {
+        Sharing::Alone => "SELECT CAST(pg_try_advisory_lock($1) AS INT)",
+        Sharing::Cluster => "SELECT CAST(pg_try_advisory_lock_shared($1) AS INT)",
+    };
+    let locked: i32 = sqlx::query_scalar(sql).bind(LOCK_KEY).fetch_one(connection).await?;
     Ok(locked == 1)
 }
 
@@ -368,26 +430,34 @@ async fn fleet(connection: &mut AnyConnection) -> Result<Option<Fleet>, Error> {
     }
 }
 
-/// Stores what this server has in common with its fleet, unless the fleet has another key.
+/// Stores what this server has in common with its fleet, unless the fleet has another key. A server
+/// alone may change the prefix.
 async fn join_fleet(
     connection: &mut AnyConnection,
     identity: &ServerIdentity,
 ) -> Result<Option<Fleet>, Error> {
-    sqlx::query(
-        "INSERT INTO fleet (id, key_id, topic_prefix) VALUES (1, $1, $2)
-         ON CONFLICT (id) DO UPDATE SET topic_prefix = excluded.topic_prefix
-         WHERE fleet.key_id = excluded.key_id",
-    )
-    .bind(&identity.key_id)
-    .bind(&identity.topic_prefix)
-    .execute(&mut *connection)
-    .await?;
+    let sql = match identity.sharing {
+        Sharing::Alone => {
+            "INSERT INTO fleet (id, key_id, topic_prefix) VALUES (1, $1, $2)
+             ON CONFLICT (id) DO UPDATE SET topic_prefix = excluded.topic_prefix
+             WHERE fleet.key_id = excluded.key_id"
+        }
+        Sharing::Cluster => {
+            "INSERT INTO fleet (id, key_id, topic_prefix) VALUES (1, $1, $2)
+             ON CONFLICT (id) DO NOTHING"
+        }
+    };
+    sqlx::query(sql)
+        .bind(&identity.key_id)
+        .bind(&identity.topic_prefix)
+        .execute(&mut *connection)
+        .await?;
     fleet(connection).await
 }
 
 /// Names the holder, by the database's clock, after the writes of the holder before: these have
-/// passed the condition of their first statement already.
-async fn set_holder(connection: &mut AnyConnection, run: &str) -> Result<(), Error> {
+/// passed the condition of their first statement already. `None`: every server may write.
+async fn set_holder(connection: &mut AnyConnection, run: Option<&str>) -> Result<(), Error> {
     execute(connection, POSTGRES_LOCKS.exclusive).await?;
     sqlx::query(
         "UPDATE write_lock SET holder = $1,

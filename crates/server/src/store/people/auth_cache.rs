@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 use task_proto::desired::BlobRef;
 use task_proto::trust::token::{Token, TokenKind};
 use task_proto::{Digest, RobotId};
+use tokio::sync::watch;
 
 use crate::domain::person::Person;
 use crate::store::{FetchGrant, PageSession, TokenHolder};
@@ -26,6 +27,8 @@ const MAX_AGE: Duration = Duration::from_secs(5);
 #[derive(Debug, Clone, Default)]
 pub(in crate::store) struct AuthCache {
     entries: Arc<Mutex<CacheEntries>>,
+    /// Changes with each write of this process that may have changed an answer.
+    written: watch::Sender<()>,
 }
 
 #[derive(Debug, Default)]
@@ -186,6 +189,16 @@ impl AuthCache {
         InvalidationGuard { auth_cache: self.clone(), invalidates: false }
     }
 
+    /// Forgets all answers: another process has changed the database.
+    pub(in crate::store) fn forget(&self) {
+        self.entries.lock().unwrap_or_else(PoisonError::into_inner).clear();
+    }
+
+    /// Changes with each write of this process that may have changed an answer.
+    pub(in crate::store) fn changed(&self) -> watch::Receiver<()> {
+        self.written.subscribe()
+    }
+
     fn entries(&self) -> MutexGuard<'_, CacheEntries> {
         // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing
         // half-done.
@@ -216,7 +229,8 @@ impl CacheEntries {
 impl Drop for InvalidationGuard {
     fn drop(&mut self) {
         if self.invalidates {
-            self.auth_cache.entries.lock().unwrap_or_else(PoisonError::into_inner).clear();
+            self.auth_cache.forget();
+            self.auth_cache.written.send_replace(());
         }
     }
 }

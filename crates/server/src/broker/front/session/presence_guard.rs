@@ -23,8 +23,8 @@ impl<'a> PresenceGuard<'a> {
         peer: SocketAddr,
         connection: u64,
     ) -> Option<Self> {
-        let Client::Robot { robot, .. } = client else { return None };
-        context.inbox.connected(robot, Some(peer), connection);
+        let Client::Robot { robot, token_number } = client else { return None };
+        context.inbox.connected(robot, Some(peer), connection, Some(*token_number));
         Some(Self { inbox: &*context.inbox, robot: robot.clone(), connection })
     }
 }

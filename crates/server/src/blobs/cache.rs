@@ -10,6 +10,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::SystemTime;
 
+use nix::sys::stat::futimens;
+use nix::sys::time::TimeSpec;
 use task_proto::Digest;
 use task_proto::ids::digest::Algorithm;
 
@@ -72,7 +74,7 @@ impl Cache {
     /// Records that a copy was opened.
     pub(super) fn record_use(&self, digest: Digest, file: &Arc<File>) {
         // Best effort: a wrong time only makes another copy go first.
-        let _ = file.set_modified(SystemTime::now());
+        let _ = futimens(file, &TimeSpec::UTIME_NOW, &TimeSpec::UTIME_NOW);
         let mut opened = self.opened();
         let known = opened.entry(digest).or_default();
         if known.strong_count() == 0 {

@@ -12,6 +12,7 @@ mod auth;
 mod bulk;
 mod cli;
 mod cli_people;
+mod cluster_rows;
 mod commands;
 mod common_store;
 mod common_store_servers;

@@ -80,7 +80,7 @@ impl SessionReader {
     }
 
     fn take(&mut self, session: RobotSession) {
-        let RobotSession { robot, run, epoch, change, since_ms, seen_ms, left_ms, address } =
+        let RobotSession { robot, run, epoch, change, since_ms, seen_ms, left_ms, address, agent } =
             session;
         let run: Arc<str> = run.into();
         let position = self.positions.entry(run.clone()).or_default();
@@ -88,7 +88,9 @@ impl SessionReader {
         let is_new = position.is_caught_up;
         let left_at = left_ms.filter(|_| is_new).map(|_| Instant::now());
         let address = address.and_then(|address| address.parse().ok());
-        let elsewhere = SessionElsewhere { run, since_ms, seen_ms, left_ms, address, left_at };
+        let agent = agent.and_then(|agent| serde_json::from_str(&agent).ok());
+        let elsewhere =
+            SessionElsewhere { run, since_ms, seen_ms, left_ms, address, agent, left_at };
         let Some(shared) = self.cluster.presence.shared() else { return };
         if self.writer.has_newer(&robot, epoch) {
             return;

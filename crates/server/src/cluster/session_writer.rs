@@ -93,6 +93,7 @@ impl SessionWriter {
             since_ms: session.since_ms,
             seen_ms: session.seen_ms,
             address: session.address.map(|address| address.to_string()),
+            agent: session.agent.as_ref().and_then(|agent| serde_json::to_string(agent).ok()),
         }
     }
 

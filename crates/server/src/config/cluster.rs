@@ -116,7 +116,11 @@ mod tests {
             (&[("TASKD_DATABASE", "sqlite:/x")], url, "cluster in taskd.toml: a cluster requires"),
             (&[POSTGRES], "[cluster]", "cluster.url in taskd.toml: missing"),
             (&[POSTGRES, ("TASKD_STANDBY", "true")], url, "standby in taskd.toml: a server of a"),
-            (&[POSTGRES, ("TASKD_BROKER", "mqtt://u:p@b")], url, "broker in taskd.toml: the servers"),
+            (
+                &[POSTGRES, ("TASKD_BROKER", "mqtt://u:p@b")],
+                url,
+                "broker in taskd.toml: the servers",
+            ),
             (
                 &[POSTGRES],
                 "[cluster]\nname = \"a b\"",

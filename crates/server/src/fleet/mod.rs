@@ -6,6 +6,7 @@ pub mod part_requests;
 pub mod presence;
 pub mod requests;
 pub mod robot_logs;
+pub mod robot_presence;
 pub mod robot_vitals;
 pub mod sessions_elsewhere;
 pub mod shared_presence;

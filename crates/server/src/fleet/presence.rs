@@ -8,8 +8,9 @@ use std::net::SocketAddr;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use task_proto::{Digest, InstanceId, RobotId};
+use task_proto::{InstanceId, RobotId};
 
+pub use super::robot_presence::{AgentIdentity, RobotPresence};
 use super::shared_presence::{SessionHere, SharedPresence};
 use crate::domain::instance_history::InstanceHistory;
 
@@ -30,44 +31,6 @@ pub struct Presence {
     robots: Mutex<HashMap<RobotId, PresenceRecord>>,
     /// The exchange with the other servers; `None`: this server is alone.
     shared: Option<SharedPresence>,
-}
-
-/// The presence of one robot.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct RobotPresence {
-    /// Connected over MQTT, or heard over HTTP within the window.
-    pub online: bool,
-    /// The last known address, if any. Port 0: the client of a trusted proxy, with an unknown port.
-    pub address: Option<SocketAddr>,
-    /// Start of the MQTT connection, if connected here or at another server.
-    pub connected_since_ms: Option<u64>,
-    /// The number of that connection, if it is to this server.
-    pub connection: Option<u64>,
-    /// Time of the last message or request.
-    pub last_seen_ms: u64,
-    /// Two instances of the robot keep displacing each other.
-    pub duplicate: bool,
-    /// Another instance has appeared recently, and waits for the known instance to fall silent.
-    pub has_waiting_instance: bool,
-}
-
-impl RobotPresence {
-    /// The address for people: `ip:port`, or the IP address alone if the port is unknown.
-    pub fn address_text(&self) -> Option<String> {
-        self.address.map(|address| match address.port() {
-            0 => address.ip().to_string(),
-            _ => address.to_string(),
-        })
-    }
-}
-
-/// An agent's statement about itself.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct AgentIdentity {
-    /// The instance, which is one start of the agent.
-    pub instance: InstanceId,
-    /// The place where the agent runs; absent from older agents.
-    pub place: Option<Digest>,
 }
 
 /// The result of an agent's statement about itself.
@@ -191,6 +154,7 @@ impl Presence {
             since_ms: seen.connected_since_ms,
             seen_ms: seen.last_seen_ms,
             address: seen.address,
+            agent: record.serving.as_ref().map(|(agent, _)| agent.clone()),
         })
     }
 
@@ -232,6 +196,12 @@ impl Presence {
         {
             shared.instances.add(robot, &agent.instance, now_ms);
         }
+        if let Some(elsewhere) =
+            self.shared.as_ref().and_then(|shared| shared.elsewhere.agent(robot, now_ms))
+            && record.serving.as_ref().is_none_or(|(_, active_ms)| *active_ms <= elsewhere.1)
+        {
+            record.serving = Some(elsewhere);
+        }
         if !record.hands_over_to(&agent, now_ms) {
             record.last_wait_ms = Some(now_ms);
             return Admission { is_serving: false, needs_state: false };
@@ -241,6 +211,9 @@ impl Presence {
         // The session of an older agent gets its state without identifying itself.
         let needs_state = agent.place.is_some() && (is_first_in_session || !is_known);
         record.serving = Some((agent, now_ms));
+        if !is_known {
+            self.to_share(robot);
+        }
         Admission { is_serving: true, needs_state }
     }
 
@@ -482,6 +455,8 @@ impl PresenceRecord {
 
 #[cfg(test)]
 mod tests {
+    use task_proto::Digest;
+
     use super::*;
 
     const MINUTE_MS: u64 = 60_000;

@@ -9,7 +9,7 @@ use std::time::Instant;
 use task_proto::RobotId;
 
 use super::live_nodes::LiveNodes;
-use super::presence::RobotPresence;
+use super::robot_presence::{AgentIdentity, RobotPresence};
 use super::shared_presence::MOVE_TIME;
 
 /// Maximum sessions in memory; those beyond the limit are not shown as online.
@@ -32,6 +32,8 @@ pub struct SessionElsewhere {
     pub seen_ms: u64,
     pub left_ms: Option<u64>,
     pub address: Option<SocketAddr>,
+    /// The agent that serves the robot's work.
+    pub agent: Option<AgentIdentity>,
     /// When the end of the session became known; `None`: before this server looked.
     pub left_at: Option<Instant>,
 }
@@ -82,6 +84,13 @@ impl SessionsElsewhere {
     /// Whether the robot is online at another server.
     pub fn is_online(&self, robot: &RobotId) -> bool {
         self.sessions().get(robot).is_some_and(|session| self.counts(session))
+    }
+
+    /// The agent that serves the robot's work at another server, and when it was last there.
+    pub(super) fn agent(&self, robot: &RobotId, now_ms: u64) -> Option<(AgentIdentity, u64)> {
+        let sessions = self.sessions();
+        let session = sessions.get(robot)?;
+        Some((session.agent.clone()?, session.left_ms.unwrap_or(now_ms)))
     }
 
     /// Whether the robot has an MQTT connection to another server.
@@ -165,6 +174,7 @@ mod tests {
             seen_ms: 5,
             left_ms: None,
             address: "10.0.0.7:4000".parse().ok(),
+            agent: None,
             left_at: None,
         };
         assert!(!sessions.put(&robot, session.clone()), "its server does not live");

@@ -10,6 +10,7 @@ use task_proto::{InstanceId, RobotId};
 use tokio::sync::Notify;
 
 use super::live_nodes::LiveNodes;
+use super::robot_presence::AgentIdentity;
 use super::sessions_elsewhere::SessionsElsewhere;
 
 /// A robot that comes back within this time, at any server, was not away.
@@ -39,6 +40,8 @@ pub struct SessionHere {
     pub since_ms: Option<u64>,
     pub seen_ms: u64,
     pub address: Option<SocketAddr>,
+    /// The agent that serves the robot's work.
+    pub agent: Option<AgentIdentity>,
 }
 
 impl SharedPresence {

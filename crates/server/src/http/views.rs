@@ -46,7 +46,11 @@ impl Views {
     pub(super) fn of_robot(&self, row: RobotRow) -> RobotView {
         let (id, now_ms) = (&row.robot.id, self.clock.now_ms());
         let (presence, vitals) = (self.presence.get(id, now_ms), self.vitals.newest(id));
-        let conditions = server_conditions(&row, presence.as_ref(), self.robot_limiter.penalty(id));
+        // Each server of a cluster has seen only its own part.
+        let is_duplicate = presence.as_ref().is_some_and(|presence| presence.duplicate)
+            || row.instances.as_ref().is_some_and(|instances| instances.is_duplicate(now_ms));
+        let penalty = self.robot_limiter.penalty(id);
+        let conditions = server_conditions(&row, presence.as_ref(), is_duplicate, penalty);
         let KnownRobot { id, name, mac, labels } = row.robot;
         let mut host = row.host;
         let effective_settings = host.as_mut().and_then(|host| host.settings.take());
@@ -110,6 +114,7 @@ impl Views {
 fn server_conditions(
     row: &RobotRow,
     presence: Option<&RobotPresence>,
+    is_duplicate: bool,
     penalty: Option<String>,
 ) -> Vec<Condition> {
     let (generation, observed) = (row.generation, row.observed_generation);
@@ -118,7 +123,7 @@ fn server_conditions(
         (
             "duplicate_identity",
             has(
-                presence.is_some_and(|presence| presence.duplicate),
+                is_duplicate,
                 "two agents use this robot's identity and keep displacing each other; enroll one of them again",
             ),
         ),

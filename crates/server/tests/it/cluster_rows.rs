@@ -33,6 +33,7 @@ fn session(robot: &RobotId, known_epoch: Option<u64>, since_ms: Option<u64>) -> 
         since_ms,
         seen_ms: 7,
         address: Some("10.0.0.7:4000".to_owned()),
+        agent: None,
     }
 }
 
@@ -103,6 +104,7 @@ async fn session_at_another_server_replaces_the_older(database: TestDatabase) {
         seen_ms: 7,
         left_ms: None,
         address: Some("10.0.0.7:4000".to_owned()),
+        agent: None,
     };
     assert_eq!(changed(store, "b-1", 0).await, [expected]);
     let node_of = async |live: &[&str]| {

@@ -20,6 +20,8 @@ pub struct NewRobotSession {
     pub since_ms: Option<u64>,
     pub seen_ms: u64,
     pub address: Option<String>,
+    /// The agent that serves the robot's work, as JSON.
+    pub agent: Option<String>,
 }
 
 /// A session that has ended.
@@ -44,6 +46,8 @@ pub struct RobotSession {
     pub seen_ms: u64,
     pub left_ms: Option<u64>,
     pub address: Option<String>,
+    /// The agent that serves the robot's work, as JSON.
+    pub agent: Option<String>,
 }
 
 /// The number of a run's last statement that a reader has seen.
@@ -60,7 +64,7 @@ pub struct SessionNode {
     pub url: Option<String>,
 }
 
-const SESSION_TYPES: [&str; 6] = ["TEXT", "BIGINT", "BIGINT", "BIGINT", "BIGINT", "TEXT"];
+const SESSION_TYPES: [&str; 7] = ["TEXT", "BIGINT", "BIGINT", "BIGINT", "BIGINT", "TEXT", "TEXT"];
 const LEFT_TYPES: [&str; 3] = ["TEXT", "BIGINT", "BIGINT"];
 /// The most changed rows of one read.
 const MAX_CHANGED: i64 = 5_000;
@@ -95,16 +99,18 @@ impl RobotSessions<&Store> {
         let first_run = 3 + sessions.len() * SESSION_TYPES.len();
         let runs = values(first_run, live_runs.len().max(1), &["TEXT"]);
         let sql = format!(
-            "WITH v (robot_id, epoch, token_number, since_ms, seen_ms, address) AS ({})
-             INSERT INTO robot_sessions
-                 (robot_id, run, epoch, change, token_number, since_ms, seen_ms, left_ms, address)
-             SELECT robot_id, $1, epoch + 1, $2, token_number, since_ms, seen_ms, NULL, address
+            "WITH v (robot_id, epoch, token_number, since_ms, seen_ms, address, agent) AS ({})
+             INSERT INTO robot_sessions (robot_id, run, epoch, change, token_number, since_ms,
+                 seen_ms, left_ms, address, agent)
+             SELECT robot_id, $1, epoch + 1, $2, token_number, since_ms, seen_ms, NULL, address,
+                 agent
              FROM v WHERE TRUE
              ON CONFLICT (robot_id) DO UPDATE SET run = excluded.run, change = excluded.change,
                  epoch = CASE WHEN robot_sessions.epoch < excluded.epoch THEN excluded.epoch
                      ELSE robot_sessions.epoch + 1 END,
                  token_number = excluded.token_number, since_ms = excluded.since_ms,
-                 seen_ms = excluded.seen_ms, left_ms = NULL, address = excluded.address
+                 seen_ms = excluded.seen_ms, left_ms = NULL, address = excluded.address,
+                 agent = excluded.agent
              WHERE (excluded.epoch = 1 OR robot_sessions.epoch < excluded.epoch)
                AND (excluded.since_ms IS NOT NULL OR robot_sessions.since_ms IS NULL
                    OR robot_sessions.left_ms IS NOT NULL OR robot_sessions.run = excluded.run
@@ -120,7 +126,8 @@ impl RobotSessions<&Store> {
                 .bind(stored(session.token_number))
                 .bind(session.since_ms.map(stored))
                 .bind(stored(session.seen_ms))
-                .bind(session.address.as_deref());
+                .bind(session.address.as_deref())
+                .bind(session.agent.as_deref());
         }
         if live_runs.is_empty() {
             query = query.bind(run);
@@ -185,7 +192,8 @@ impl RobotSessions<&Store> {
         }
         let sql = format!(
             "WITH p (run, change) AS ({})
-             SELECT s.robot_id, s.run, s.epoch, s.change, s.since_ms, s.seen_ms, s.left_ms, s.address
+             SELECT s.robot_id, s.run, s.epoch, s.change, s.since_ms, s.seen_ms, s.left_ms,
+                 s.address, s.agent
              FROM p JOIN robot_sessions s ON s.run = p.run AND s.change > p.change
              ORDER BY s.change LIMIT $1",
             values(2, positions.len(), &["TEXT", "BIGINT"])
@@ -268,5 +276,6 @@ fn session(row: &AnyRow) -> Result<RobotSession, StoreError> {
         seen_ms: number(row.try_get("seen_ms")?),
         left_ms: row.try_get::<Option<i64>, _>("left_ms")?.map(number),
         address: row.try_get("address")?,
+        agent: row.try_get("agent")?,
     })
 }

@@ -11,6 +11,7 @@ use task_proto::ids::Labels;
 use task_proto::messages::report::{Condition, HostFacts, LinkFacts, Phase, Report, TaskReport};
 use task_proto::{DeploymentId, Digest, Generation, MacAddress, RobotId, RobotName, TaskName};
 
+use crate::domain::instance_history::InstanceHistory;
 use crate::domain::person::Scope;
 use crate::store::deliveries;
 use crate::store::repositories::Robots;
@@ -46,6 +47,8 @@ pub struct RobotRow {
     /// The tasks, sorted by name.
     pub tasks: Vec<RobotTask>,
     pub settings: Option<RobotSettings>,
+    /// The agents that displaced each other, as the servers of a cluster have seen them.
+    pub instances: Option<InstanceHistory>,
 }
 
 /// The version of a robot's password at an external broker.
@@ -434,7 +437,7 @@ const WITH_TASK: &str = "SELECT robot_id FROM assignments WHERE task = $1 AND de
 
 const ROBOT_ROWS: &str =
     "SELECT r.id, r.name, r.mac, r.labels, r.enrolled_at_ms, r.generation, r.observed_generation,
-         r.report, r.link, r.last_seen_ms, r.revoked_at_ms, r.awaits_approval, r.settings
+         r.report, r.link, r.last_seen_ms, r.revoked_at_ms, r.awaits_approval, r.settings, r.instances
      FROM robots r WHERE r.removed_at_ms IS NULL";
 
 /// The desired tasks of each robot, and the tasks that it is still removing. The first condition
@@ -533,6 +536,7 @@ fn robot_row(
         link: from_optional_json("robots.link", row.try_get("link")?)?,
         tasks,
         settings: settings(row)?,
+        instances: from_optional_json("robots.instances", row.try_get("instances")?)?,
     })
 }
 

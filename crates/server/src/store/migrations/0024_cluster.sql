@@ -12,7 +12,8 @@ CREATE TABLE nodes (
 );
 
 -- The last session of each robot at any of these servers. epoch grows with each write of the row. change grows with
--- each statement of the run. since_ms: the start of the MQTT connection; NULL: the robot polls over HTTP.
+-- each statement of the run. since_ms: the start of the MQTT connection; NULL: the robot polls over HTTP. agent: the
+-- agent that serves the robot's work, as JSON.
 CREATE TABLE robot_sessions (
     robot_id TEXT PRIMARY KEY,
     run TEXT NOT NULL,
@@ -22,7 +23,8 @@ CREATE TABLE robot_sessions (
     since_ms BIGINT,
     seen_ms BIGINT NOT NULL,
     left_ms BIGINT,
-    address TEXT
+    address TEXT,
+    agent TEXT
 );
 CREATE INDEX robot_sessions_by_change ON robot_sessions (run, change);
 

@@ -38,7 +38,7 @@ use packages::{outputs, package};
 use people::{audit, login, token, user};
 use robots::{enroll_token, logs, robot, ros};
 pub use service::doctor::INTEGRITY_REMEDY;
-use service::{broker, doctor, server, status, version};
+use service::{broker, cluster, doctor, server, status, version};
 
 /// The operator's commands, those of every day first; `serve` is added to them.
 #[derive(Debug, Subcommand)]
@@ -87,6 +87,9 @@ pub enum Command {
     /// Show the server's version, traffic, sessions and rules
     #[command(subcommand)]
     Server(server::Action),
+    /// List and drain the servers of a cluster, export their keys
+    #[command(subcommand)]
+    Cluster(cluster::Action),
     /// Sign in with a user name and a password
     Login(login::LoginArgs),
     /// Sign out of a server
@@ -271,6 +274,7 @@ async fn dispatch(
         Command::Lifecycle(args) => ros::lifecycle(&open()?, args).await,
         Command::Status => status::status(&open()?).await,
         Command::Server(action) => server::run(&open()?, action).await,
+        Command::Cluster(action) => cluster::run(connection, action).await,
         Command::Login(args) => login::login(connection, args).await,
         Command::Logout => login::logout(connection).await,
         Command::Whoami => user::whoami(&open()?).await,

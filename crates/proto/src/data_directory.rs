@@ -12,6 +12,17 @@ use crate::CaPin;
 pub const LOCK: &str = "taskd.lock";
 /// The file with the first operator's token.
 pub const OPERATOR_TOKEN: &str = "operator.token";
+/// The file with the key that signs desired states.
+pub const SIGNING_KEY: &str = "signing.key";
+/// The file with the key of the private certificate authority.
+pub const AUTHORITY_KEY: &str = "ca.key";
+/// The file with the authority's certificate.
+pub const AUTHORITY_CERTIFICATE: &str = "ca.pem";
+/// The file with the secret from which robots' passwords at an external broker are derived.
+pub const BROKER_SECRET: &str = "broker.secret";
+/// The files that all servers of a cluster share.
+pub const SECRETS: [&str; 5] =
+    [SIGNING_KEY, AUTHORITY_KEY, AUTHORITY_CERTIFICATE, BROKER_SECRET, OPERATOR_TOKEN];
 /// The file with the bound [`Addresses`].
 pub const ADDRESSES: &str = "addresses.json";
 

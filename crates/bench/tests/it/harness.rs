@@ -298,6 +298,11 @@ impl Server {
             .to_owned()
     }
 
+    /// A request as the operator.
+    pub fn request(&self, method: reqwest::Method, path: &str) -> reqwest::RequestBuilder {
+        self.client.request(method, self.url(path)).bearer_auth(self.operator_token())
+    }
+
     /// `GET` as the operator; `None` while the server is down.
     pub async fn get(&self, path: &str) -> Option<Value> {
         let answer =

@@ -5,6 +5,7 @@ mod approval;
 mod broker;
 mod client_ids;
 mod cluster;
+mod cluster_forward;
 mod cluster_nodes;
 mod confinement;
 mod corridor;

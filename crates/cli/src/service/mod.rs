@@ -1,6 +1,7 @@
-//! Owns the commands about the server itself; it never changes anything.
+//! Owns the commands about the servers themselves; it never changes a robot or a package.
 
 pub(super) mod broker;
+pub(super) mod cluster;
 pub(super) mod doctor;
 pub(super) mod server;
 pub(super) mod status;

@@ -152,7 +152,7 @@ fn site_row(site: &SiteStatus) -> Vec<String> {
 const SESSIONS: Columns = Columns {
     name: "robot",
     narrow: &["robot", "address", "since", "subscriptions"],
-    wide: &["id", "in", "out"],
+    wide: &["id", "in", "out", "server"],
 };
 
 /// The connected clients, and the subscriptions of each.
@@ -185,6 +185,7 @@ fn session_row(session: &RobotSession) -> Vec<String> {
         session.robot.to_string(),
         format_bytes(session.traffic.bytes_in),
         format_bytes(session.traffic.bytes_out),
+        session.node.as_ref().map_or_else(|| "-".to_owned(), ToString::to_string),
     ]
 }
 

@@ -3,10 +3,10 @@
 use serde_json::json;
 use task_proto::api::{
     AssignmentView, BrokerStatus, DatabaseStatus, DeliveryDecision, DiskStatus, EditRobot, Event,
-    FeedEntry, FeedKind, FeedPage, HttpTraffic, LimitView, ListenerView, MqttTraffic,
-    PastAssignment, ReportStatus, RobotCounts, RobotSession, RuleView, ServerRules, ServerStatus,
-    SessionList, SiteStatus, Subscription, TaskHistory, TimelineEntry, Traffic, TransferStatus,
-    VitalsView,
+    FeedEntry, FeedKind, FeedPage, HttpTraffic, LimitView, ListenerView, MqttTraffic, NodeFigures,
+    NodeState, NodeView, PastAssignment, ReportStatus, RobotCounts, RobotSession, RuleView,
+    ServerRules, ServerStatus, SessionList, SiteStatus, Subscription, TaskHistory, TimelineEntry,
+    Traffic, TransferStatus, VitalsView,
 };
 use task_proto::desired::settings::{EffectiveSettings, RobotLimits, RobotSettings};
 use task_proto::desired::{Delivery, DesiredState, TargetState};
@@ -191,9 +191,33 @@ fn server_status_documents() {
             address: "127.0.0.1:8080".to_owned(),
             tls: false,
         }],
+        nodes: vec![
+            NodeView {
+                name: parsed("one"),
+                url: Some("https://10.0.0.11:8080".to_owned()),
+                version: "0.1.0".to_owned(),
+                state: NodeState::Serving,
+                answers: true,
+                beat_age_ms: None,
+                figures: Some(NodeFigures { uptime_s: 3600, ..NodeFigures::default() }),
+            },
+            NodeView {
+                name: parsed("two"),
+                url: None,
+                version: "0.1.0".to_owned(),
+                state: NodeState::Lost,
+                answers: false,
+                beat_age_ms: Some(12_000),
+                figures: None,
+            },
+        ],
     };
     check("server_status.json", &status);
     check_tolerance::<ServerStatus>("server_status.json");
+    assert_eq!(
+        serde_json::from_str::<NodeState>("\"asleep\"").expect("tolerated"),
+        NodeState::Unknown
+    );
     let session = RobotSession {
         robot: robot(),
         name: parsed("atlas"),
@@ -204,6 +228,7 @@ fn server_status_documents() {
             qos: 1,
         }],
         traffic: Traffic::default(),
+        node: Some(parsed("one")),
     };
     check(
         "session_list.json",

@@ -45,7 +45,7 @@ pub use fetch::Arrival;
 use fetch::Fetches;
 pub use local_move::{MoveError, Moved, move_to_common_store};
 use upload::Uploads;
-pub use upload::{InvalidUploadId, UploadId};
+pub use upload::{InvalidUploadId, UploadId, upload_mark};
 
 use crate::config::BlobRead;
 
@@ -72,6 +72,9 @@ pub struct BlobSettings {
     pub reserve_bytes: u64,
     /// The most bytes of local copies, if the blobs lie in a common store.
     pub max_cache_bytes: u64,
+    /// The first digits of uploads' ids, by which the servers of a cluster know where an upload
+    /// began; `None`: the server is alone.
+    pub upload_mark: Option<u32>,
 }
 
 impl Default for BlobSettings {
@@ -84,6 +87,7 @@ impl Default for BlobSettings {
             max_robot_bytes: 40 << 30,
             reserve_bytes: 0,
             max_cache_bytes: 50 << 30,
+            upload_mark: None,
         }
     }
 }

@@ -34,6 +34,8 @@ const IDLE_TIMEOUT: Duration = Duration::from_secs(60);
 /// some on the way.
 const MAX_OF_ROBOT: usize = 8;
 const ID_DIGITS: usize = 32;
+/// The first digits of an id, which tell the server of a cluster at which the upload began.
+const MARK_DIGITS: usize = 8;
 /// The longest file name that file systems accept, in bytes.
 const MAX_NAME_BYTES: usize = 255;
 
@@ -46,9 +48,26 @@ pub struct UploadId(String);
 #[error("not a valid upload id")]
 pub struct InvalidUploadId;
 
+/// The mark of uploads that begin at the server with this name.
+pub fn upload_mark(server: &str) -> u32 {
+    let [a, b, c, d, ..] = Sha256::digest(server).0;
+    u32::from_be_bytes([a, b, c, d])
+}
+
 impl UploadId {
-    fn random() -> Self {
-        Self(format!("{:0width$x}", rand::random::<u128>(), width = ID_DIGITS))
+    /// A random id with this mark; without one it is random too.
+    fn random(mark: Option<u32>) -> Self {
+        let id = Self(format!("{:0width$x}", rand::random::<u128>(), width = ID_DIGITS));
+        match mark {
+            Some(mark) => Self(format!("{mark:08x}{}", &id.0[MARK_DIGITS..])),
+            None => id,
+        }
+    }
+
+    /// The id's first digits: the mark of the server at which the upload began, if that was in a
+    /// cluster.
+    pub fn mark(&self) -> u32 {
+        u32::from_str_radix(&self.0[..MARK_DIGITS], 16).unwrap_or_default()
     }
 
     /// The id as text.
@@ -230,7 +249,7 @@ impl Uploads {
 
     /// A file name that is unused in the directory.
     pub(super) fn unused_path(&self) -> PathBuf {
-        self.directory.join(UploadId::random().as_str())
+        self.directory.join(UploadId::random(None).as_str())
     }
 
     fn active(&self) -> MutexGuard<'_, HashMap<UploadId, ActiveUpload>> {
@@ -317,7 +336,7 @@ fn eviction_candidate(
 impl Blobs {
     /// Begins an upload. Only requests for the same repository can reach it.
     pub async fn begin_upload(&self, repository: &RepositoryName) -> Result<UploadId, BlobError> {
-        let id = UploadId::random();
+        let id = UploadId::random(self.shared.settings.upload_mark);
         let path = self.shared.uploads.directory.join(file_name(&id, repository));
         let created = Upload::create(path.clone()).map_err(BlobError::disk("create", &path))?;
         let active = ActiveUpload::new(repository.clone(), created);

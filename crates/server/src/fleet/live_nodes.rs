@@ -77,6 +77,12 @@ impl LiveNodes {
             || known.others.get(run).is_some_and(|pulse| pulse.moved_at.is_some())
     }
 
+    /// The time since the beat of another live run moved.
+    pub fn rest(&self, run: &str, now: Instant) -> Option<Duration> {
+        let moved_at = self.known().others.get(run)?.moved_at?;
+        Some(now.saturating_duration_since(moved_at))
+    }
+
     /// The number of live servers, with this one.
     pub fn count(&self) -> usize {
         self.runs().len().max(1)

@@ -72,6 +72,8 @@ pub enum FollowEvent {
     },
     /// The robot can't be reached.
     Away(Arc<str>),
+    /// The robot has a session at another server, where its followers have to ask anew.
+    Moved,
     Lines(Arc<LogBatch>),
 }
 

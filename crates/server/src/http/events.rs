@@ -272,6 +272,7 @@ impl EventFeed {
         }
         self.send_deployments(views, deployments).await?;
         let robots: Vec<RobotId> = robots.into_iter().collect();
+        views.peers.ask_for_figures(robots.iter()).await;
         for row in views.store.robots().among(&robots).await? {
             let audience = Audience::Robot(Arc::new(row.robot.clone()));
             self.send(&Event::Robot { robot: Box::new(views.of_robot(row)) }, audience);

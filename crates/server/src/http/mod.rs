@@ -10,6 +10,7 @@ pub mod extract;
 mod fleet;
 mod openapi;
 mod orders;
+pub mod peers;
 pub mod registry;
 pub mod server;
 pub mod shared_lists;
@@ -37,11 +38,14 @@ use self::accounts::person_sessions::PersonSessions;
 use self::accounts::session::{PageCookies, PageSignIn};
 use self::events::EventStreams;
 use self::fleet::broker::BrokerAccounts;
+use self::fleet::forward::{ForwardState, IfSilent, to_robots_server};
 use self::fleet::live_robots::LiveRobots;
+use self::peers::{FIGURES_PATH, Peers, SESSIONS_PATH, STATUS_PATH};
 use self::registry::Registry;
 use self::registry::archives::ArchiveReaders;
 use self::registry::upload::UploadSpace;
 use self::server::gauges::Gauges;
+use self::server::node_drain::NodeDrain;
 use self::server::readiness::Readiness;
 use self::server::server_facts::ServerFacts;
 use self::shared_lists::SharedLists;
@@ -58,7 +62,9 @@ use crate::fleet::robot_vitals::RobotVitals;
 use crate::link::mqtt_access::MqttAccess;
 use crate::link::transfers::Transfers;
 use crate::net::http_connections::HttpConnections;
-use crate::orders::actions::{Actions, DeploymentActions, PersonActions, RobotActions};
+use crate::orders::actions::{
+    Actions, DeploymentActions, NodeActions, PersonActions, RobotActions,
+};
 use crate::orders::changes::Changes;
 use crate::orders::desired_states::DesiredStates;
 use crate::orders::report_writer::ReportWriter;
@@ -71,7 +77,7 @@ use fleet::{ask, broker, bulk, enroll, feed, history, logs, mqtt, outputs, robot
 use openapi::{Describe as _, Draft};
 use orders::{deployments, tasks};
 use registry::{archives, oci, packages, upload};
-use server::{health, status, web};
+use server::{health, nodes, status, web};
 
 /// State for the handlers. Clones share the same parts: a request makes several clones on its way.
 #[derive(Clone)]
@@ -133,6 +139,10 @@ pub struct AppParts {
     pub readiness: Readiness,
     /// The live servers of the cluster.
     pub nodes: LiveNodes,
+    /// The way out of service.
+    pub drain: NodeDrain,
+    /// The other servers of the cluster.
+    pub peers: Peers,
     /// Cancelled when the server stops.
     pub stop: CancellationToken,
 }
@@ -165,15 +175,18 @@ macro_rules! parts {
 
 parts! {
     actions.deployments: DeploymentActions,
+    actions.nodes: NodeActions,
     actions.people: PersonActions,
     actions.robots: RobotActions,
     broker: Broker,
     clock: Clock,
     desired_states: DesiredStates,
+    drain: NodeDrain,
     facts: Arc<ServerFacts>,
     lists: Arc<SharedLists>,
     mqtt: Arc<MqttAccess>,
     nodes: LiveNodes,
+    peers: Peers,
     readiness: Readiness,
     reports: ReportWriter,
     stop: CancellationToken,
@@ -197,16 +210,17 @@ composite_parts! {
     BrokerAccounts { mqtt, store }
     EventStreams { changes, clock, events, stop, store }
     Gauges {
-        blobs, broker, clock, data, facts, http_traffic, nodes, presence, reports, robot_limiter,
-        slow_figures, store, transfers,
+        blobs, broker, clock, data, facts, http_traffic, nodes, peers, presence, readiness, reports,
+        robot_limiter, slow_figures, store, transfers,
     }
     LiveRobots {
-        broker, changes, clock, desired_states, http_connections, logs, presence, requests, vitals,
+        broker, changes, clock, desired_states, http_connections, logs, peers, presence, requests,
+        vitals,
     }
     PageSignIn { changes, clock, cookies, provider, store }
     PersonSessions { broker, changes }
-    Registry { blobs, changes, clock, readers, store, transfers }
-    Views { clock, presence, robot_limiter, store, vitals }
+    Registry { blobs, changes, clock, peers, readers, store, transfers }
+    Views { clock, peers, presence, robot_limiter, store, vitals }
 }
 
 /// The body limit of most routes, in bytes.
@@ -229,6 +243,8 @@ pub struct Route {
     body_bytes: usize,
     deadline: Option<Duration>,
     waits_for_robot: bool,
+    /// Whether the server with the robot's session answers, and what if it is silent.
+    forwarded: Option<IfSilent>,
     handler: MethodRouter<App>,
     describe: fn(&mut Draft),
 }
@@ -257,9 +273,19 @@ impl Route {
             body_bytes,
             deadline,
             waits_for_robot,
+            forwarded: None,
             handler,
             describe,
         }
+    }
+
+    /// A question of another server of the cluster, which is not part of the API.
+    fn peer<H, T>(path: &'static str, handler: H) -> Self
+    where
+        H: Handler<T, App>,
+        T: 'static,
+    {
+        Self::new(Method::POST, path, Access::Peer, handler, |_| {})
     }
 
     /// A route for every method. The handler streams and enforces its own limits.
@@ -276,6 +302,7 @@ impl Route {
             body_bytes,
             deadline: None,
             waits_for_robot,
+            forwarded: None,
             handler,
             describe,
         }
@@ -294,6 +321,11 @@ impl Route {
     /// person's other requests under way.
     fn waiting_for_robot(self) -> Self {
         Self { waits_for_robot: true, ..self }
+    }
+
+    /// Marks a route about a robot that is answered by the server with the robot's session.
+    fn by_robots_server(self, if_silent: IfSilent) -> Self {
+        Self { forwarded: Some(if_silent), ..self }
     }
 
     /// Removes the deadline, for a streamed answer.
@@ -332,6 +364,8 @@ pub fn routes() -> Vec<Route> {
         route!(GET "/api/v1/server/status", Person(Read), status::status),
         route!(GET "/api/v1/server/sessions", Person(Read), status::sessions),
         route!(GET "/api/v1/server/rules", Person(Read), status::rules),
+        route!(GET "/api/v1/cluster/nodes", Person(Read), nodes::list),
+        route!(POST "/api/v1/cluster/nodes/{node}/drain", Person(Administer), nodes::drain),
         route!(GET "/api/v1/broker", Person(Administer), broker::files),
         route!(GET "/api/v1/broker/nats", Person(Administer), broker::nats_file),
         route!(GET "/api/v1/broker/check", Person(Administer), broker::check),
@@ -357,7 +391,8 @@ pub fn routes() -> Vec<Route> {
         route!(POST "/api/v1/enrollment-tokens", Person(Administer), enroll::create_token),
         route!(DELETE "/api/v1/enrollment-tokens/{enrollment}", Person(Administer), enroll::revoke_token),
         route!(GET "/api/v1/robots", Person(Read), robots::list),
-        route!(GET "/api/v1/robots/{robot}", Person(Read), robots::show),
+        route!(GET "/api/v1/robots/{robot}", Person(Read), robots::show)
+            .by_robots_server(IfSilent::AnswerHere),
         route!(PATCH "/api/v1/robots/{robot}", Person(Maintain), robots::edit),
         route!(DELETE "/api/v1/robots/{robot}", Person(Maintain), robots::remove),
         route!(POST "/api/v1/bulk/labels", Person(Maintain), bulk::labels)
@@ -375,9 +410,17 @@ pub fn routes() -> Vec<Route> {
             .body_bytes(REPORT_BODY_BYTES),
         route!(POST "/api/v1/robots/{robot}/telemetry", OwnRobot, vitals::telemetry),
         route!(GET "/api/v1/robots/{robot}/tasks", Person(Read), history::tasks),
-        route!(GET "/api/v1/robots/{robot}/vitals", Person(Read), vitals::show),
-        route!(POST "/api/v1/robots/{robot}/ask", Person(Read), ask::ask).waiting_for_robot(),
-        route!(GET "/api/v1/robots/{robot}/logs", Person(Read), logs::show).streaming(),
+        route!(GET "/api/v1/robots/{robot}/vitals", Person(Read), vitals::show)
+            .by_robots_server(IfSilent::AnswerHere),
+        route!(POST "/api/v1/robots/{robot}/ask", Person(Read), ask::ask)
+            .waiting_for_robot()
+            .by_robots_server(IfSilent::Refuse),
+        route!(GET "/api/v1/robots/{robot}/logs", Person(Read), logs::show)
+            .streaming()
+            .by_robots_server(IfSilent::AnswerHere),
+        Route::peer(STATUS_PATH, server::peers::status),
+        Route::peer(SESSIONS_PATH, server::peers::sessions),
+        Route::peer(FIGURES_PATH, server::peers::figures),
     ];
     routes.extend(order_routes());
     routes
@@ -436,9 +479,17 @@ pub fn router(app: App) -> Router {
         let state = GuardState { app: app.clone(), access, deadline, waits_for_robot };
         let guard = middleware::from_fn_with_state(state, guard);
         let limit = DefaultBodyLimit::max(route.body_bytes);
+        let forward = |handler: MethodRouter<App>| match route.forwarded {
+            Some(if_silent) => {
+                let (app, body_bytes) = (app.clone(), route.body_bytes);
+                let state = ForwardState { app, if_silent, body_bytes };
+                handler.route_layer(middleware::from_fn_with_state(state, to_robots_server))
+            }
+            None => handler,
+        };
         let handler = match route.method {
             // The guard is not needed before the "method not allowed" answer.
-            Some(_) => route.handler.route_layer(limit).route_layer(guard),
+            Some(_) => forward(route.handler.route_layer(limit)).route_layer(guard),
             None => route.handler.layer(limit).layer(guard),
         };
         router = router.route(route.path, handler);

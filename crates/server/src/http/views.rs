@@ -12,6 +12,7 @@ use task_proto::messages::report::{Condition, Phase};
 use task_proto::{DeploymentId, RobotId};
 
 use super::error::ApiError;
+use super::peers::{Peers, RobotFigures};
 use crate::domain::limits::robot_limiter::RobotLimiter;
 use crate::domain::person::Person;
 use crate::fleet::presence::{Presence, RobotPresence};
@@ -27,6 +28,7 @@ pub struct Views {
     pub presence: Arc<Presence>,
     pub robot_limiter: Arc<RobotLimiter>,
     pub vitals: RobotVitals,
+    pub peers: Peers,
     pub clock: Clock,
 }
 
@@ -45,11 +47,14 @@ impl Views {
     /// The view of a robot's row, without its MQTT connection.
     pub(super) fn of_robot(&self, row: RobotRow) -> RobotView {
         let (id, now_ms) = (&row.robot.id, self.clock.now_ms());
-        let (presence, vitals) = (self.presence.get(id, now_ms), self.vitals.newest(id));
+        let presence = self.presence.get(id, now_ms);
         // Each server of a cluster has seen only its own part.
         let is_duplicate = presence.as_ref().is_some_and(|presence| presence.duplicate)
             || row.instances.as_ref().is_some_and(|instances| instances.is_duplicate(now_ms));
-        let penalty = self.robot_limiter.penalty(id);
+        let mut figures = self.peers.figures(id).unwrap_or_default();
+        let (vitals, penalty) = (self.vitals.newest(id), self.robot_limiter.penalty(id));
+        figures.merge(RobotFigures { vitals, penalty });
+        let RobotFigures { vitals, penalty } = figures;
         let conditions = server_conditions(&row, presence.as_ref(), is_duplicate, penalty);
         let KnownRobot { id, name, mac, labels } = row.robot;
         let mut host = row.host;

@@ -2,7 +2,7 @@
 //! local copies. This module never moves a blob from one to the other.
 
 use super::ServeError;
-use crate::blobs::{BlobSettings, Blobs, CommonStore};
+use crate::blobs::{BlobSettings, Blobs, CommonStore, upload_mark};
 use crate::config::Config;
 use crate::domain::blob_store_url::BlobStoreUrl;
 use crate::store::Store;
@@ -60,6 +60,7 @@ pub(super) fn blob_settings(config: &Config) -> BlobSettings {
         max_cache_bytes: config
             .blob_cache_bytes
             .unwrap_or(defaults.max_cache_bytes.min(disk_bytes / CACHE_SHARE)),
+        upload_mark: config.cluster.as_ref().map(|cluster| upload_mark(cluster.name.as_str())),
         ..defaults
     }
 }

@@ -16,7 +16,7 @@ use crate::system::clock::Clock;
 /// The first and the longest pause before an unavailable database is tried again.
 const RETRY_PAUSES: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(5)];
 
-/// The first operator, whose token exists on every server.
+/// The first operator, whose token exists on every server outside of a cluster.
 pub struct FirstOperator {
     pub token: Token,
     /// The file with the token.
@@ -26,7 +26,7 @@ pub struct FirstOperator {
 /// A database, and the steps between its opening and its first use.
 pub struct Database {
     store: Store,
-    operator: FirstOperator,
+    operator: Option<FirstOperator>,
     /// Receives each robot's last agent from the database.
     presence: Arc<Presence>,
     /// The database contains the first operator, and the presence the agents.
@@ -41,7 +41,7 @@ impl Database {
     /// [`Self::supervise`] waits for it.
     pub async fn open(
         store: Store,
-        operator: FirstOperator,
+        operator: Option<FirstOperator>,
         presence: Arc<Presence>,
         clock: Clock,
     ) -> Result<Self, StoreError> {
@@ -125,11 +125,19 @@ impl Database {
     /// Ensures that the token in the directory is valid in this database, which may be new or
     /// restored.
     async fn register_operator(&self) -> Result<(), StoreError> {
-        let (now_ms, FirstOperator { token, path }) = (self.clock.now_ms(), &self.operator);
+        let Some(FirstOperator { token, path }) = &self.operator else { return Ok(()) };
+        let now_ms = self.clock.now_ms();
         if self.store.tokens().holder(token, now_ms).await?.is_some() {
             return Ok(());
         }
         match self.store.tokens().create_first(token, now_ms).await {
+            // Another server of the cluster was faster.
+            Err(error)
+                if error.is_unique_violation()
+                    && self.store.tokens().holder(token, now_ms).await?.is_some() =>
+            {
+                Ok(())
+            }
             Err(error) if error.is_unique_violation() => {
                 tracing::warn!("the token in {} was revoked and stays revoked", path.display());
                 Ok(())

@@ -8,6 +8,7 @@ pub mod database;
 mod jobs;
 pub mod log_limits;
 mod part_settings;
+mod peers;
 mod standby;
 
 use std::net::SocketAddr;
@@ -53,7 +54,8 @@ use crate::http::connection::listener;
 use crate::http::events::EventFeed;
 use crate::http::registry::archives::ArchiveReaders;
 use crate::http::registry::upload::UploadSpace;
-use crate::http::server::readiness::{DiskProbe, Readiness, ReadinessCheck};
+use crate::http::server::node_drain::NodeDrain;
+use crate::http::server::readiness::{DiskProbe, ReadinessCheck};
 use crate::http::server::server_facts::ServerFacts;
 use crate::http::{App, AppParts};
 use crate::link::downlink::Downlink;
@@ -117,6 +119,9 @@ pub enum ServeError {
     /// The OpenID provider can't be used.
     #[error(transparent)]
     Oidc(#[from] OidcSetupError),
+    /// The client of the other servers can't be made.
+    #[error("cluster: the HTTP client can't be created")]
+    Peers(#[from] reqwest::Error),
     /// HTTP can't be served.
     #[error("cannot listen for HTTP on {address}")]
     Listen {
@@ -145,8 +150,7 @@ pub struct Server {
     store: Store,
     unusable: watch::Receiver<Option<String>>,
     broker: Broker,
-    readiness: Readiness,
-    drain_time: Duration,
+    drain: NodeDrain,
     tls: Option<Tls>,
     stop: CancellationToken,
     tasks: TaskTracker,
@@ -157,7 +161,7 @@ pub struct Server {
 impl Server {
     /// Starts all parts. On return, both listeners accept and their addresses are published.
     pub async fn start(config: Config, clock: Clock) -> Result<Self, ServeError> {
-        let data = DataDirectory::open(&config.data)?;
+        let data = DataDirectory::open(&config.data)?.with_secrets(config.secrets());
         let key = Arc::new(data.signing_key()?);
         let public_key = key.public_key();
         let tls = open_tls(&config, &data, &clock)?;
@@ -178,13 +182,14 @@ impl Server {
             (Arc::<ServerLoad>::default(), Arc::<HttpConnections>::default());
         let planner = DeliveryPlanner::new(&config.delivery, presence.clone(), load.clone());
         let base = Base { clock, store, presence, changes, tls, http_connections };
+        let peers = peers::join(&config, &base, &nodes, &key, &stop)?;
         let (desired_states, actions) = orders(&config, &base, key, &planner);
         let robots = start_robot_traffic(&config, &data, &base, planner).await?;
         let RobotTraffic { writer, reports, requests, logs, vitals, robot_limiter, broker, mqtt } =
             robots;
         let Base { clock, store, presence, changes, tls, http_connections } = base;
         let provider = provider(&config)?;
-        let (readiness, drain_time) = (Readiness::default(), config.drain);
+        let drain = NodeDrain::new(broker.clone(), config.drain);
         let transfers = Transfers::new(&config.transfers, config.delivery.site_label.clone());
         let facts = Arc::new(ServerFacts::new(
             &config,
@@ -223,8 +228,10 @@ impl Server {
             http_traffic: Arc::default(),
             people: Arc::new(PersonLimits::new(config.people)),
             data: data.path().to_owned(),
-            readiness: readiness.clone(),
             nodes,
+            readiness: drain.readiness(),
+            drain: drain.clone(),
+            peers,
             stop: stop.clone(),
         });
         start_readiness(&tasks, &app).await;
@@ -240,8 +247,7 @@ impl Server {
             store,
             unusable,
             broker,
-            readiness,
-            drain_time,
+            drain,
             tls,
             stop,
             tasks,
@@ -290,12 +296,7 @@ impl Server {
     /// Prepares the stop for the setting's time: `/readyz` answers 503 from now on, and after half of
     /// the time, in which a balancer notices, the robots' sessions end one after the other.
     pub async fn drain(&self) {
-        if self.drain_time.is_zero() {
-            return;
-        }
-        self.readiness.begin_drain();
-        tokio::time::sleep(self.drain_time / 2).await;
-        self.broker.drain(self.drain_time / 2).await;
+        self.drain.before_stop().await;
     }
 
     /// Stops within ten seconds: listeners close, requests and sessions end, received reports are
@@ -531,8 +532,9 @@ async fn open_database(
     presence: Arc<Presence>,
     clock: Clock,
 ) -> Result<Database, ServeError> {
-    let operator =
-        FirstOperator { token: data.operator_token()?, path: data.operator_token_path() };
+    let operator = data
+        .operator_token()?
+        .map(|token| FirstOperator { token, path: data.operator_token_path() });
     Ok(Database::open(store, operator, presence, clock).await?)
 }
 

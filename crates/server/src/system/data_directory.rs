@@ -1,6 +1,7 @@
 //! The server's directory: created on the first start and locked while a server runs. It holds the
 //! signing key, the private certificate authority, the secret from which robots' passwords at an
-//! external broker are derived, the first operator's token and the bound addresses. This module
+//! external broker are derived, the first operator's token and the bound addresses. In a cluster
+//! the keys may be in a directory that all servers share, and then they are only read. This module
 //! never touches the database or the blobs in the directory, except for their file modes.
 
 use std::fs::{DirBuilder, File, OpenOptions, Permissions, TryLockError};
@@ -10,15 +11,13 @@ use std::os::unix::fs::{
 };
 use std::path::{Path, PathBuf};
 
-use task_proto::data_directory::{ADDRESSES, Addresses, LOCK, OPERATOR_TOKEN};
+use task_proto::data_directory::{
+    ADDRESSES, AUTHORITY_CERTIFICATE, AUTHORITY_KEY, Addresses, BROKER_SECRET, LOCK,
+    OPERATOR_TOKEN, SIGNING_KEY,
+};
 use task_proto::ids::digest::{hex, unhex};
 use task_proto::trust::envelope::SigningKey;
 use task_proto::trust::token::{Token, TokenKind};
-
-const SIGNING_KEY: &str = "signing.key";
-const BROKER_SECRET: &str = "broker.secret";
-const AUTHORITY_KEY: &str = "ca.key";
-const AUTHORITY_CERTIFICATE: &str = "ca.pem";
 
 /// Free space and size of the file system that holds `path`, in bytes.
 pub(crate) fn disk_space(path: &Path) -> Option<(u64, u64)> {
@@ -32,6 +31,8 @@ pub(crate) fn disk_space(path: &Path) -> Option<(u64, u64)> {
 pub struct DataDirectory {
     path: PathBuf,
     lock: File,
+    /// The directory with the cluster's keys, in place of own ones.
+    secrets: Option<PathBuf>,
 }
 
 /// The reason why the directory can't be used.
@@ -59,6 +60,12 @@ pub enum DataError {
     /// A file has unexpected content.
     #[error("{} does not contain {expected}; restore the file, or move it away to get a new one", path.display())]
     Content { path: PathBuf, expected: &'static str },
+    /// A file that all servers of the cluster share has unexpected content.
+    #[error("cluster.secrets: {} does not contain {expected}; copy the file that the other servers have", path.display())]
+    SharedContent { path: PathBuf, expected: &'static str },
+    /// A file that all servers of the cluster share is missing.
+    #[error("cluster.secrets: {} is missing; copy the file that the other servers have, or run taskd cluster export", path.display())]
+    NoSecret { path: PathBuf },
 }
 
 impl DataError {
@@ -95,7 +102,7 @@ impl DataDirectory {
         loop {
             match lock.try_lock() {
                 Ok(()) => {
-                    let data = Self { path: path.to_owned(), lock };
+                    let data = Self { path: path.to_owned(), lock, secrets: None };
                     data.restrict_permissions()?;
                     data.unpublish();
                     return Ok(data);
@@ -113,6 +120,12 @@ impl DataDirectory {
                 }
             }
         }
+    }
+
+    /// Takes the keys from this directory and makes none.
+    pub fn with_secrets(mut self, secrets: Option<PathBuf>) -> Self {
+        self.secrets = secrets;
+        self
     }
 
     /// Removes permissions that an earlier version, an umask or a copy has given to other accounts:
@@ -174,7 +187,7 @@ impl DataDirectory {
 
     /// The path of the operator's token.
     pub fn operator_token_path(&self) -> PathBuf {
-        self.path.join(OPERATOR_TOKEN)
+        self.secret_path(OPERATOR_TOKEN)
     }
 
     /// The key that signs desired states, created on the first start. Robots pin the key, so it is
@@ -193,31 +206,36 @@ impl DataDirectory {
     /// The key of the private certificate authority, as PEM; `fresh` on the first start. Robots pin
     /// the authority.
     pub fn authority_key(&self, fresh: String) -> Result<String, DataError> {
-        self.read_or_create(&self.path.join(AUTHORITY_KEY), || fresh)
+        self.secret_text(AUTHORITY_KEY, || fresh)
     }
 
     /// The authority's own certificate, as PEM, for users who import it; `fresh` on the first
     /// start.
     pub fn authority_certificate(&self, fresh: String) -> Result<String, DataError> {
-        self.read_or_create(&self.path.join(AUTHORITY_CERTIFICATE), || fresh)
+        self.secret_text(AUTHORITY_CERTIFICATE, || fresh)
     }
 
     /// The error that one of these two files is unusable.
     pub fn authority_error(&self, is_key: bool) -> DataError {
-        let (name, expected) = match is_key {
-            true => (AUTHORITY_KEY, "a certificate authority's key"),
-            false => (AUTHORITY_CERTIFICATE, "the certificate of the key in ca.key"),
-        };
-        DataError::Content { path: self.path.join(name), expected }
+        match is_key {
+            true => self.content_error(AUTHORITY_KEY, "a certificate authority's key"),
+            false => {
+                self.content_error(AUTHORITY_CERTIFICATE, "the certificate of the key in ca.key")
+            }
+        }
     }
 
-    /// The token of the first operator, created on the first start.
-    pub fn operator_token(&self) -> Result<Token, DataError> {
-        let path = self.operator_token_path();
-        let text = self.read_or_create(&path, || Token::random(TokenKind::Operator).reveal())?;
+    /// The token of the first operator, created on the first start. A cluster may have none.
+    pub fn operator_token(&self) -> Result<Option<Token>, DataError> {
+        let text = match self
+            .secret_text(OPERATOR_TOKEN, || Token::random(TokenKind::Operator).reveal())
+        {
+            Err(DataError::NoSecret { .. }) => return Ok(None),
+            text => text?,
+        };
         match text.trim().parse::<Token>() {
-            Ok(token) if token.kind() == TokenKind::Operator => Ok(token),
-            _ => Err(DataError::Content { path, expected: "an operator's token" }),
+            Ok(token) if token.kind() == TokenKind::Operator => Ok(Some(token)),
+            _ => Err(self.content_error(OPERATOR_TOKEN, "an operator's token")),
         }
     }
 
@@ -235,6 +253,19 @@ impl DataDirectory {
         let _ = std::fs::remove_file(self.path.join(ADDRESSES));
     }
 
+    /// The path of a key's file.
+    fn secret_path(&self, name: &str) -> PathBuf {
+        self.secrets.as_ref().unwrap_or(&self.path).join(name)
+    }
+
+    fn content_error(&self, name: &str, expected: &'static str) -> DataError {
+        let path = self.secret_path(name);
+        match self.secrets {
+            Some(_) => DataError::SharedContent { path, expected },
+            None => DataError::Content { path, expected },
+        }
+    }
+
     /// 32 bytes in a separate file, created on the first call.
     fn secret(
         &self,
@@ -242,9 +273,27 @@ impl DataDirectory {
         expected: &'static str,
         create: fn() -> [u8; 32],
     ) -> Result<[u8; 32], DataError> {
-        let path = self.path.join(name);
-        let text = self.read_or_create(&path, || hex(&create()))?;
-        unhex(text.trim()).ok_or(DataError::Content { path, expected })
+        let text = self.secret_text(name, || hex(&create()))?;
+        unhex(text.trim()).ok_or_else(|| self.content_error(name, expected))
+    }
+
+    /// The text of a key's file. Only the data directory's own is created if missing: a server with
+    /// a key of its own would be a stranger to its cluster's robots.
+    fn secret_text(
+        &self,
+        name: &str,
+        create: impl FnOnce() -> String,
+    ) -> Result<String, DataError> {
+        let path = self.secret_path(name);
+        if self.secrets.is_none() {
+            return self.read_or_create(&path, create);
+        }
+        match std::fs::read_to_string(&path) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {
+                Err(DataError::NoSecret { path })
+            }
+            read => read.map_err(DataError::io(path)),
+        }
     }
 
     fn read_or_create(
@@ -307,9 +356,32 @@ mod tests {
         assert_eq!(mode(&data.operator_token_path()), 0o600);
         assert_eq!(data.signing_key().expect("read").to_bytes(), key.to_bytes());
         assert_eq!(data.operator_token().expect("read"), token);
+        assert!(token.is_some());
         std::fs::write(path.join(SIGNING_KEY), "nonsense").expect("written");
         let message = data.signing_key().err().expect("refused").to_string();
         assert!(message.contains("signing.key does not contain a signing key"), "{message}");
+    }
+
+    #[test]
+    fn shared_secrets_are_read_and_never_created() {
+        let parent = tempfile::tempdir().expect("temp dir");
+        let secrets = parent.path().join("secrets");
+        let data = DataDirectory::open(&parent.path().join("data")).expect("opens");
+        let own_key = data.signing_key().expect("made").to_bytes();
+        let data = data.with_secrets(Some(secrets.clone()));
+        let message = data.signing_key().err().expect("refused").to_string();
+        let expected = format!("cluster.secrets: {}/signing.key is missing", secrets.display());
+        assert!(message.starts_with(&expected), "{message}");
+        assert!(data.broker_secret().is_err() && data.authority_key(String::new()).is_err());
+        assert_eq!(data.operator_token().expect("optional"), None);
+        assert!(!secrets.exists(), "nothing is created");
+        std::fs::create_dir(&secrets).expect("made");
+        std::fs::write(secrets.join(SIGNING_KEY), hex(&[7; 32])).expect("written");
+        assert_eq!(data.signing_key().expect("read").to_bytes(), [7; 32]);
+        assert_ne!(own_key, [7; 32]);
+        std::fs::write(secrets.join(OPERATOR_TOKEN), "nonsense").expect("written");
+        let message = data.operator_token().err().expect("refused").to_string();
+        assert!(message.contains("copy the file that the other servers have"), "{message}");
     }
 
     #[test]

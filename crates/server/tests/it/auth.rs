@@ -54,6 +54,7 @@ impl TestCaller {
             Access::PersonOrRobot => {
                 matches!(self, Operator | OperatorByPassword | Robot | OtherRobot)
             }
+            Access::Peer => false,
         };
         match self {
             _ if is_let_in => None,

@@ -21,6 +21,7 @@ use taskd::domain::limits::robot_limiter::{RobotLimiter, RobotLimits};
 use taskd::domain::person::Person;
 use taskd::fleet::presence::Presence;
 use taskd::fleet::robot_vitals::RobotVitals;
+use taskd::http::peers::Peers;
 use taskd::http::views::Views;
 use taskd::orders::actions::{
     ActionSettings, Actions, DeploymentActions, Enrolled, IdempotencyKey, PersonActions,
@@ -146,6 +147,7 @@ impl Fleet {
             presence: presence.clone(),
             robot_limiter: RobotLimiter::new(RobotLimits::default()),
             vitals: RobotVitals::default(),
+            peers: Peers::default(),
             clock: clock.clone(),
         };
         Self {

@@ -132,7 +132,7 @@ async fn robots_are_not_offline_since_before_a_standby_took_over() {
     let operator = FirstOperator { token: Token::random(TokenKind::Operator), path: "".into() };
     let (standby, clock) = (server(&database, "b"), Clock::system());
     let taken_ms = clock.now_ms();
-    let opened = Database::open(standby, operator, presence.clone(), clock.clone()).await;
+    let opened = Database::open(standby, Some(operator), presence.clone(), clock.clone()).await;
     let opened = opened.expect("the lock is free");
     let robot = RobotId::random();
     let offline_ms = presence.offline_ms([&robot], clock.now_ms())[0].expect("not seen");

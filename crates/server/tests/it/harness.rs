@@ -56,7 +56,7 @@ impl TestServer {
         configure(&mut config);
         let clock = Clock::fixed(NOW_MS);
         let server = Server::start(config, clock.clone()).await.expect("the server starts");
-        let operator = server.data().operator_token().expect("a token");
+        let operator = server.data().operator_token().expect("read").expect("a token");
         let client = client(Trust::by(server.addresses().ca_pin));
         Self { directory, server, clock, operator, client }
     }

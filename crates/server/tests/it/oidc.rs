@@ -499,7 +499,7 @@ async fn sign_in_works_with_a_third_party_provider() {
     // Its tokens are from now.
     let clock = Clock::system();
     let server = Server::start(config, clock.clone()).await.expect("the server starts");
-    let operator = server.data().operator_token().expect("a token");
+    let operator = server.data().operator_token().expect("read").expect("a token");
     let server = TestServer { directory, server, clock, operator, client: Client::new() };
     let mut visitor = Visitor::new(&server);
     let sent = visitor.get(&server.url("/api/v1/oidc/sign-in")).await;

@@ -182,6 +182,7 @@ impl Fixture {
         }
         path = path
             .replace("{task}", "walker")
+            .replace("{node}", "rack-1")
             .replace("{*file}", "app.js")
             .replace("{itself}", self.robot.id.as_str());
         path = path.replace("{package}", "walker").replace("{version}", "1.0.0");

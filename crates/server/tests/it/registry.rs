@@ -22,6 +22,7 @@ use taskd::domain::blob_store_url::BlobStoreUrl;
 use taskd::domain::person::Person;
 use taskd::http::auth::Caller;
 use taskd::http::connection::drain::drain_unread;
+use taskd::http::peers::Peers;
 use taskd::http::registry::archives::ArchiveReaders;
 use taskd::http::registry::{Registry, oci};
 use taskd::link::transfers::Transfers;
@@ -68,7 +69,8 @@ impl TestRegistry {
         let transfers = Transfers::new(&TransferLimits::default(), site_label);
         let (clock, changes) = (Clock::fixed(NOW_MS), Changes::new());
         let readers = ArchiveReaders::default();
-        let registry = Registry { store, blobs, clock, transfers, changes, readers };
+        let peers = Peers::default();
+        let registry = Registry { store, blobs, clock, transfers, changes, readers, peers };
         Self { base: serve(registry.clone(), caller).await, client: client(), registry, data }
     }
 

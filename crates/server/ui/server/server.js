@@ -111,6 +111,7 @@ export class ServerView {
       }
       <div class="server-body">
         <div>
+          ${status?.nodes ? servers(status) : nothing}
           ${status ? sites(status) : nothing}
           ${this.#sessionTable(now)}
         </div>
@@ -301,6 +302,37 @@ function sparkline(values) {
   return html`<svg class="curve" viewBox="0 0 100 20" preserveAspectRatio="none"
     aria-hidden="true">${svg`<polyline points=${points.join(' ')}></polyline>`}</svg>`;
 }
+
+const NODE_STATES = {
+  serving: 'serving',
+  draining: 'draining',
+  silent: 'does not answer',
+  lost: 'lost',
+};
+
+/** The servers of the cluster. The figures above are those of all that answer. */
+const servers = ({ nodes: list }) => html`
+  <section aria-labelledby="servers">
+    <header><h2 id="servers">Servers</h2></header>
+    <div class="scroll" tabindex="0" role="group" aria-labelledby="servers"><table>
+      <thead><tr><th>Server</th><th>State</th><th class="number">Sessions</th>
+        <th class="number">Reports</th><th class="number">Transfers</th><th>Version</th>
+        <th class="number">Last beat</th></tr></thead>
+      <tbody>${list.map(
+        ({ name, url, version, state, answers, beat_age_ms: age, figures: own }) => html`
+        <tr data-node=${name}>
+          <td>${name}${answers ? html` <span class="quiet">this page</span>` : nothing}<br>
+            <span class="code quiet">${url ?? '–'}</span></td>
+          <td>${statusDot(state === 'serving', NODE_STATES[state] ?? words(state))}</td>
+          <td class="number">${own ? number(own.mqtt.robots_connected) : '–'}</td>
+          <td class="number">${own ? `${own.reports.per_s.toFixed(1)} /s` : '–'}</td>
+          <td class="number">${own ? number(own.transfers.active) : '–'}</td>
+          <td>${version}</td>
+          <td class="number">${age == null ? '–' : `${(age / 1000).toFixed(1)} s ago`}</td>
+        </tr>`,
+      )}</tbody>
+    </table></div>
+  </section>`;
 
 const sites = ({ sites: list }) => html`
   <section aria-labelledby="sites">

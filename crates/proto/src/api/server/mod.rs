@@ -9,9 +9,9 @@ pub use self::mqtt::{
     BrokerAddress, BrokerCheck, BrokerChecks, BrokerFiles, ExternalBroker, MqttEndpoint, NatsFile,
 };
 pub use self::status::{
-    BrokerStatus, DatabaseStatus, DiskStatus, LimitView, ListenerView, MAX_SITES, ReportStatus,
-    RobotCounts, RobotSession, RuleView, ServerRules, ServerStatus, SessionList, SiteStatus,
-    Subscription, TransferStatus,
+    BrokerStatus, DatabaseStatus, DiskStatus, LimitView, ListenerView, MAX_SITES, NodeFigures,
+    NodeList, NodeState, NodeView, ReportStatus, RobotCounts, RobotSession, RuleView, ServerRules,
+    ServerStatus, SessionList, SiteStatus, Subscription, TransferStatus,
 };
 use crate::CaPin;
 use crate::trust::envelope::PublicKey;

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{HttpTraffic, MqttTraffic, Traffic};
 use crate::desired::Delivery;
-use crate::ids::LabelValue;
+use crate::ids::{LabelValue, NodeName};
 use crate::{RobotId, RobotName};
 
 /// `GET /server/status` (read). Robots and sites are limited to those visible to the user.
@@ -37,6 +37,10 @@ pub struct ServerStatus {
     pub broker: BrokerStatus,
     /// Addresses that the server listens on.
     pub listeners: Vec<ListenerView>,
+    /// The servers of the cluster, by name, of which each counts above as far as it answers; empty:
+    /// the server is alone.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub nodes: Vec<NodeView>,
 }
 
 /// The most sites of a [`ServerStatus`].
@@ -90,11 +94,12 @@ pub struct SiteStatus {
 pub struct ReportStatus {
     /// Reports stored per second.
     pub per_s: f64,
-    /// Median time from a report's arrival until it was stored; absent without reports.
+    /// Median time from a report's arrival until it was stored; absent without reports. In a
+    /// cluster that of the slowest server.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub latency_ms_p50: Option<f64>,
     /// 99th percentile of the time from a report's arrival until it was stored; absent without
-    /// reports.
+    /// reports. In a cluster that of the slowest server.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub latency_ms_p99: Option<f64>,
 }
@@ -157,6 +162,76 @@ pub struct ListenerView {
     pub tls: bool,
 }
 
+/// `GET /cluster/nodes` (read).
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+pub struct NodeList {
+    /// The servers of the cluster, by name; empty: the server is alone.
+    pub nodes: Vec<NodeView>,
+}
+
+/// A server of a cluster.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+pub struct NodeView {
+    /// The server's name.
+    pub name: NodeName,
+    /// Where the other servers reach it; absent: nowhere.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub url: Option<String>,
+    /// The server's version.
+    pub version: String,
+    /// Whether it serves.
+    pub state: NodeState,
+    /// Whether it is the server that gives this answer.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub answers: bool,
+    /// Time since it last gave a sign of life in the database, as the answering server saw it;
+    /// absent for the answering server.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub beat_age_ms: Option<u64>,
+    /// Its figures; absent if it did not answer in time.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub figures: Option<NodeFigures>,
+}
+
+/// Whether a server of a cluster serves.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(rename_all = "snake_case")]
+pub enum NodeState {
+    /// It serves.
+    Serving,
+    /// It sends its robots to other servers.
+    Draining,
+    /// It lives, and does not answer the other servers.
+    Silent,
+    /// It gives no sign of life.
+    Lost,
+    /// A state that this program does not know.
+    #[serde(other)]
+    Unknown,
+}
+
+/// Figures of one server since its start.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct NodeFigures {
+    /// Seconds since the server started.
+    pub uptime_s: u64,
+    /// Whether it sends its robots to other servers.
+    pub draining: bool,
+    /// Its MQTT traffic.
+    pub mqtt: MqttTraffic,
+    /// Its HTTP traffic.
+    pub http: HttpTraffic,
+    /// Robots that pull packages from it.
+    pub transfers: TransferStatus,
+    /// Rate and latency of storing its reports.
+    pub reports: ReportStatus,
+}
+
 /// `GET /server/sessions` (read), optionally `?limit=` (1 to 1,000, absent: 100) and
 /// `?after=<name>`: the robots connected over MQTT and visible to the user.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -189,6 +264,10 @@ pub struct RobotSession {
     pub subscriptions: Vec<Subscription>,
     /// Traffic of the connection.
     pub traffic: Traffic,
+    /// The server of the cluster that has the connection; absent outside of a cluster, or if that
+    /// server did not answer in time. Then subscriptions and traffic are not known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub node: Option<NodeName>,
 }
 
 /// A client's subscription.

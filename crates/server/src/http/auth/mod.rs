@@ -30,6 +30,7 @@ use self::person_limits::{RequestKind, RequestPermit};
 use self::robot_limits::throttle;
 use super::App;
 use super::error::{ApiError, ROBOT_REVOKED};
+use super::peers::Proven;
 use crate::domain::limits::robot_limiter::Channel;
 use crate::domain::person::Person;
 use crate::link::gatekeeper::announce_new_token;
@@ -54,6 +55,8 @@ pub enum Access {
     Enrollment,
     /// A person or any robot; the handler narrows the access of each.
     PersonOrRobot,
+    /// Another server of the cluster.
+    Peer,
 }
 
 /// The number of the token that a robot called with. Handlers for robots may take this as an
@@ -70,6 +73,8 @@ pub enum Caller {
     Robot(RobotId),
     /// The holder of an enrollment token.
     Enrollment(Box<Token>),
+    /// Another server of the cluster.
+    Peer,
 }
 
 impl Caller {
@@ -93,7 +98,7 @@ impl Caller {
     /// callers and enrollments.
     fn holder(&self) -> Option<Holder> {
         match self {
-            Self::Anyone => None,
+            Self::Anyone | Self::Peer => None,
             Self::Person(person) => Some(Holder::Person(person.name.clone())),
             Self::Robot(robot) => Some(Holder::Robot(robot.clone())),
             Self::Enrollment(token) => Some(Holder::Enrollment(token.id())),
@@ -109,6 +114,7 @@ impl Caller {
             Access::OwnRobot => self.robot().is_some_and(|robot| own == Some(robot.as_str())),
             Access::Enrollment => matches!(self, Self::Enrollment(_)),
             Access::PersonOrRobot => matches!(self, Self::Person(_) | Self::Robot(_)),
+            Access::Peer => *self == Self::Peer,
         }
     }
 }
@@ -159,8 +165,13 @@ pub(super) async fn guard(
     // A path that is not text names no robot; the handler answers with "not found".
     let own = params.iter().flatten().find(|(name, _)| *name == "robot").map(|(_, value)| value);
     let proof = request.extensions().get::<ClientProof>().cloned().unwrap_or_default();
+    let proven = guard_state.app.peers.proven(&request);
+    let peer = match proven {
+        Proven::Client(address) => SocketAddr::new(address, peer.port()),
+        Proven::Nothing | Proven::Peer => peer,
+    };
     let admitted_request =
-        match admit(&guard_state, peer, own, Credentials::of(&request, &proof)).await {
+        match admit(&guard_state, peer, own, Credentials::of(&request, &proof, proven)).await {
             Ok((caller, token_number)) => check_limits(&guard_state, caller, request.method())
                 .await
                 .map(|admitted_request| (admitted_request, token_number)),
@@ -228,7 +239,7 @@ async fn check_limits(
             }
             None
         }
-        Caller::Anyone | Caller::Enrollment(_) => None,
+        Caller::Anyone | Caller::Enrollment(_) | Caller::Peer => None,
     };
     Ok(AdmittedRequest { caller, counted_request })
 }
@@ -303,13 +314,15 @@ struct Credentials<'a> {
     headers: &'a HeaderMap,
     proof: &'a ClientProof,
     connection: Option<&'a Connection>,
+    is_peer: bool,
 }
 
 impl<'a> Credentials<'a> {
-    fn of(request: &'a Request, proof: &'a ClientProof) -> Self {
+    fn of(request: &'a Request, proof: &'a ClientProof, proven: Proven) -> Self {
         Self {
             method: request.method(),
             headers: request.headers(),
+            is_peer: proven == Proven::Peer,
             proof,
             connection: request.extensions().get(),
         }
@@ -324,6 +337,12 @@ async fn admit(
 ) -> Result<(Caller, TokenNumber), ApiError> {
     if guard_state.access == Access::Anyone {
         return Ok((Caller::Anyone, TokenNumber(0)));
+    }
+    if guard_state.access == Access::Peer && credentials.is_peer {
+        if let Some(connection) = credentials.connection {
+            connection.authenticate();
+        }
+        return Ok((Caller::Peer, TokenNumber(0)));
     }
     match identify_on_connection(&guard_state.app, &credentials).await {
         Ok((caller, token_number)) if caller.may(guard_state.access, own) => {

@@ -6,6 +6,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use http::HeaderMap;
 use task_proto::RobotId;
 use task_proto::api::{FeedKind, MqttConnection};
 use task_proto::messages::request::{Action, Answer, Ask};
@@ -18,6 +19,7 @@ use crate::fleet::presence::{AgentIdentity, Presence};
 use crate::fleet::requests::{RequestError, Requests};
 use crate::fleet::robot_logs::RobotLogs;
 use crate::fleet::robot_vitals::RobotVitals;
+use crate::http::peers::Peers;
 use crate::link::uplink;
 use crate::net::http_connections::HttpConnections;
 use crate::orders::changes::{Change, Changes};
@@ -36,6 +38,7 @@ pub struct LiveRobots {
     /// The source of signed states, which caches them.
     pub(in crate::http) desired_states: DesiredStates,
     pub(in crate::http) changes: Changes,
+    pub(in crate::http) peers: Peers,
     pub(in crate::http) clock: Clock,
 }
 
@@ -69,6 +72,12 @@ impl LiveRobots {
         let since_ms = presence.connected_since_ms.filter(|_| presence.connection.is_some())?;
         let traffic = self.broker.traffic_of(robot)?;
         Some(MqttConnection { since_ms, traffic })
+    }
+
+    /// True if another server of the cluster has the robot's session.
+    pub(super) async fn is_elsewhere(&self, robot: &RobotId) -> bool {
+        self.broker.traffic_of(robot).is_none()
+            && matches!(self.peers.with_session(robot, &HeaderMap::new()).await, Ok(Some(_)))
     }
 
     /// Sends a question to the robot, and waits for the answer.

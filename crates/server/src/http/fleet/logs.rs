@@ -162,21 +162,27 @@ fn stream(
         tokio::spawn(keep_following(live.clone(), streams.stop.clone(), robot));
     }
     let mut was_confirmed = false;
-    let events = BroadcastStream::new(events).filter_map(move |event| {
-        // The slots are freed when the stream is dropped.
-        let _held = (&slot, &follower);
-        let event = match event {
-            // A follower that joined later has not been told yet that the robot publishes.
-            Ok(FollowEvent::Following { again }) => (again
-                || !std::mem::replace(&mut was_confirmed, true))
-            .then_some(LogEvent::Following),
-            Ok(FollowEvent::Away(reason)) => Some(LogEvent::Away { reason: reason.to_string() }),
-            Ok(FollowEvent::Lines(batch)) => lines(&batch, &filter),
-            // The listener lagged behind, so lines are missing.
-            Err(_) => Some(LogEvent::Following),
-        };
-        std::future::ready(event.map(|event| Ok(sse_event(&event))))
-    });
+    let is_here = |event: &Result<_, _>| !matches!(event, Ok(FollowEvent::Moved));
+    let events = BroadcastStream::new(events)
+        .take_while(move |event| std::future::ready(is_here(event)))
+        .filter_map(move |event| {
+            // The slots are freed when the stream is dropped.
+            let _held = (&slot, &follower);
+            let event = match event {
+                // A follower that joined later has not been told yet that the robot publishes.
+                Ok(FollowEvent::Following { again }) => (again
+                    || !std::mem::replace(&mut was_confirmed, true))
+                .then_some(LogEvent::Following),
+                Ok(FollowEvent::Away(reason)) => {
+                    Some(LogEvent::Away { reason: reason.to_string() })
+                }
+                Ok(FollowEvent::Lines(batch)) => lines(&batch, &filter),
+                Ok(FollowEvent::Moved) => None,
+                // The listener lagged behind, so lines are missing.
+                Err(_) => Some(LogEvent::Following),
+            };
+            std::future::ready(event.map(|event| Ok(sse_event(&event))))
+        });
     // An immediate first line makes proxies pass the headers on, and tells the listener that the
     // stream is connected.
     let greeting = futures_util::stream::iter([Ok(SentEvent::default()
@@ -221,7 +227,11 @@ async fn keep_following(live: LiveRobots, stop: CancellationToken, robot: RobotI
             Err(error) => {
                 // Counts as a gap, whichever connection the robot comes back by.
                 connection = connection.map(|_| 0);
-                live.logs.notify_followers(&robot, FollowEvent::Away(error.to_string().into()));
+                let event = match live.is_elsewhere(&robot).await {
+                    true => FollowEvent::Moved,
+                    false => FollowEvent::Away(error.to_string().into()),
+                };
+                live.logs.notify_followers(&robot, event);
                 RETRY
             }
         };

@@ -6,6 +6,7 @@ pub(super) mod broker;
 pub(super) mod bulk;
 pub(super) mod enroll;
 pub(super) mod feed;
+pub(super) mod forward;
 pub(super) mod history;
 pub(super) mod live_robots;
 pub(super) mod logs;

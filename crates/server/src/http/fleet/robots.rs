@@ -82,6 +82,7 @@ async fn listed(views: &Views, by: &Person, query: &ListQuery) -> Result<RobotLi
         Some(selector) => views.store.robots().unknown(selector, &by.scope).await?,
         None => Vec::new(),
     };
+    views.peers.ask_for_figures(rows.iter().map(|row| &row.robot.id)).await;
     let robots = rows.into_iter().map(|row| views.of_robot(row)).collect();
     Ok(RobotList { robots, unknown, next, total })
 }

@@ -212,6 +212,7 @@ impl Draft {
             Access::OwnRobot => ("robot", None, &["token"]),
             Access::Enrollment => ("enrolment", None, &["token"]),
             Access::PersonOrRobot => ("person or robot", None, &["token", "password", "session"]),
+            Access::Peer => ("another server of the cluster", None, &[]),
         };
         self.operation.security = Some(schemes.iter().map(|name| scheme(name)).collect());
         let mut extensions = Extensions::from_iter([("x-caller", json!(who))]);
@@ -227,6 +228,7 @@ impl Draft {
             Access::PersonOrRobot => {
                 "For people and robots, each within their own rights.".to_owned()
             }
+            Access::Peer => "For the other servers of the cluster.".to_owned(),
         };
         let description = self.operation.description.take().filter(|text| !text.is_empty());
         self.operation.description =

@@ -18,7 +18,7 @@ use utoipa::openapi::{ComponentsBuilder, InfoBuilder, License, OpenApi, OpenApiB
 
 pub(super) use self::draft::{Draft, OrderKey, OrderRefusals};
 pub(super) use self::handler::{Answer, Created, Describe};
-use super::auth::COOKIE;
+use super::auth::{Access, COOKIE};
 use super::{Route, routes};
 use crate::http::server::web::has_current_tag;
 
@@ -110,10 +110,12 @@ pub(super) fn document(routes: &[Route]) -> OpenApi {
 }
 
 /// The routes to describe, each once: a route with and without a trailing slash counts as one.
+/// Those between the servers of a cluster are no part of the API.
 fn described(routes: &[Route]) -> impl Iterator<Item = &Route> {
     let has_longer =
         |path: &str| routes.iter().any(|other| other.path.strip_suffix('/') == Some(path));
-    routes.iter().filter(move |route| !has_longer(route.path))
+    let is_described = |route: &&Route| route.access != Access::Peer;
+    routes.iter().filter(is_described).filter(move |route| !has_longer(route.path))
 }
 
 fn scheme(kind: HttpAuthScheme, text: &str) -> Http {

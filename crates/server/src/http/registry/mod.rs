@@ -7,6 +7,7 @@ pub mod upload;
 
 use self::archives::ArchiveReaders;
 use crate::blobs::Blobs;
+use crate::http::peers::Peers;
 use crate::link::transfers::Transfers;
 use crate::orders::changes::Changes;
 use crate::store::Store;
@@ -25,4 +26,6 @@ pub struct Registry {
     pub changes: Changes,
     /// Readers of whole archives.
     pub readers: ArchiveReaders,
+    /// The other servers of the cluster, at which uploads may have begun.
+    pub peers: Peers,
 }

@@ -8,6 +8,7 @@ use std::time::Duration;
 use tokio::sync::Mutex;
 use tokio::time::Instant;
 
+use super::readiness::Readiness;
 use super::server_facts::ServerFacts;
 use crate::blobs::Blobs;
 use crate::broker::Broker;
@@ -16,6 +17,7 @@ use crate::fleet::live_nodes::LiveNodes;
 use crate::fleet::presence::Presence;
 use crate::http::connection::traffic::HttpTotals;
 use crate::http::error::ApiError;
+use crate::http::peers::Peers;
 use crate::link::transfers::Transfers;
 use crate::orders::report_writer::ReportWriter;
 use crate::store::{DatabaseSize, Store};
@@ -35,6 +37,8 @@ pub struct Gauges {
     pub(in crate::http) transfers: Transfers,
     pub(in crate::http) nodes: LiveNodes,
     pub(in crate::http) presence: Arc<Presence>,
+    pub(in crate::http) readiness: Readiness,
+    pub(in crate::http) peers: Peers,
     pub(in crate::http) broker: Broker,
     pub(in crate::http) http_traffic: Arc<HttpTotals>,
     pub(in crate::http) robot_limiter: Arc<RobotLimiter>,

@@ -25,20 +25,21 @@ pub(in crate::http) async fn healthz() -> Json<Value> {
 #[operation(tag = "server",
     responses((status = 200, description = "All components are healthy.", body = Value,
             example = json!({ "status": "ready", "database": "ok", "broker": "ok", "disk": "ok" })),
-        (status = 503, description = "A component is unhealthy, or the server is stopping.", body = Value)))]
+        (status = 503, description = "A component is unhealthy, or the server is draining or stopping.", body = Value)))]
 pub(in crate::http) async fn readyz(
     State(readiness): State<Readiness>,
     State(stop): State<CancellationToken>,
 ) -> Response {
     let verdicts = readiness.verdicts();
-    let is_stopping = readiness.is_draining() || stop.is_cancelled();
+    let is_stopping = readiness.is_stopping() || stop.is_cancelled();
     let is_healthy =
         verdicts.iter().all(|(component, problem)| problem.is_none() || !component.is_vital());
-    let is_ready = is_healthy && !is_stopping;
-    let status = match (is_stopping, is_healthy) {
-        (true, _) => "stopping",
-        (false, true) => "ready",
-        (false, false) => "not_ready",
+    let is_ready = is_healthy && !is_stopping && !readiness.is_draining();
+    let status = match is_healthy {
+        _ if is_stopping => "stopping",
+        _ if readiness.is_draining() => "draining",
+        true => "ready",
+        false => "not_ready",
     };
     let mut body = json!({ "status": status });
     for (component, problem) in verdicts {

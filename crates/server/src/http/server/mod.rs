@@ -1,7 +1,11 @@
-//! Owns the routes about the server itself, and the page's files; never changes anything.
+//! Owns the routes about the servers themselves, and the page's files; never changes a robot or an
+//! order.
 
 pub mod gauges;
 pub(super) mod health;
+pub mod node_drain;
+pub(super) mod nodes;
+pub(super) mod peers;
 pub mod readiness;
 pub mod server_facts;
 pub mod standby;

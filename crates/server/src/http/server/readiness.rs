@@ -63,6 +63,7 @@ impl Component {
 pub struct Readiness {
     verdicts: Arc<Mutex<BTreeMap<Component, Option<String>>>>,
     draining: CancellationToken,
+    stopping: CancellationToken,
 }
 
 impl Readiness {
@@ -76,14 +77,25 @@ impl Readiness {
         self.lock().clone()
     }
 
-    /// From now on the server is not ready, because it is about to stop.
+    /// From now on the server is not ready, because its clients are to use others.
     pub fn begin_drain(&self) {
         self.draining.cancel();
     }
 
-    /// Whether the server is about to stop.
+    /// The same, because the server is about to stop.
+    pub fn begin_stop(&self) {
+        self.stopping.cancel();
+        self.draining.cancel();
+    }
+
+    /// Whether clients are to use other servers.
     pub fn is_draining(&self) -> bool {
         self.draining.is_cancelled()
+    }
+
+    /// Whether the server is about to stop.
+    pub fn is_stopping(&self) -> bool {
+        self.stopping.is_cancelled()
     }
 
     fn lock(&self) -> MutexGuard<'_, BTreeMap<Component, Option<String>>> {

@@ -10,8 +10,8 @@ use serde::Deserialize;
 use task_macros::operation;
 use task_proto::RobotName;
 use task_proto::api::{
-    BrokerStatus, DatabaseStatus, DiskStatus, MAX_SITES, RobotCounts, RobotSession, ServerRules,
-    ServerStatus, SessionList, SiteStatus, TransferStatus,
+    BrokerStatus, DatabaseStatus, DiskStatus, MAX_SITES, NodeFigures, RobotCounts, RobotSession,
+    ServerRules, ServerStatus, SessionList, SiteStatus,
 };
 use task_proto::ids::LabelValue;
 use task_proto::messages::report::LinkFacts;
@@ -19,11 +19,14 @@ use tokio::time::Instant;
 use utoipa::IntoParams;
 
 use super::gauges::{Gauges, SlowValues};
+use super::nodes;
+use super::peers::{own_figures, total};
 use super::server_facts::ServerFacts;
 use crate::broker::{Broker, Health};
 use crate::domain::person::Person;
 use crate::http::error::ApiError;
 use crate::http::extract::{QueryParams, page_limit};
+use crate::http::peers::SessionFigures;
 use crate::link::transfers::Transfers;
 use crate::store::KnownRobot;
 use crate::system::data_directory::disk_space;
@@ -38,6 +41,11 @@ pub(in crate::http) async fn status(
     by: Person,
 ) -> Result<Json<ServerStatus>, ApiError> {
     let now_ms = gauges.clock.now_ms();
+    let nodes = gauges.peers.statuses(own_figures(&gauges)).await?;
+    let NodeFigures { uptime_s, mqtt, http, transfers, reports, .. } = match nodes.is_empty() {
+        true => own_figures(&gauges),
+        false => total(nodes.iter().filter_map(|status| status.figures)),
+    };
     let robots = gauges.store.robots().with_links(&by.scope).await?;
     let pinged_at = Instant::now();
     gauges.store.ping().await?;
@@ -49,18 +57,14 @@ pub(in crate::http) async fn status(
     let (free_bytes, total_bytes) = disk_space(&gauges.data).unwrap_or_default();
     Ok(Json(ServerStatus {
         version: env!("CARGO_PKG_VERSION").to_owned(),
-        uptime_s: gauges.facts.began.elapsed().as_secs(),
+        uptime_s,
         now_ms,
         robots: RobotCounts { known: robots.len() as u64, online },
-        mqtt: gauges.broker.traffic(),
-        http: gauges.http_traffic.read(),
-        transfers: TransferStatus {
-            active: gauges.transfers.running(),
-            waiting: gauges.transfers.waiting(),
-            bytes_per_s: gauges.transfers.bytes_per_s(),
-        },
+        mqtt,
+        http,
+        transfers,
         sites: sites(&gauges.transfers, &robots, is_online),
-        reports: gauges.reports.meter().read(Instant::now()),
+        reports,
         database: DatabaseStatus {
             kind: database.kind.to_owned(),
             size_bytes: database.bytes,
@@ -72,6 +76,7 @@ pub(in crate::http) async fn status(
         disk: DiskStatus { free_bytes, total_bytes, packages_bytes },
         broker: broker_status(&gauges.broker),
         listeners: gauges.facts.listeners.clone(),
+        nodes: nodes.into_iter().filter_map(nodes::view).collect(),
     }))
 }
 
@@ -153,7 +158,10 @@ pub(in crate::http) async fn sessions(
     let limit = page_limit(query.limit)?.unwrap_or(DEFAULT_LIMIT) as usize;
     let now_ms = gauges.clock.now_ms();
     let mut robots = gauges.store.robots().known(&by.scope).await?;
-    robots.retain(|robot| gauges.presence.is_connected(&robot.id));
+    robots.retain(|robot| {
+        let presence = gauges.presence.get(&robot.id, now_ms);
+        presence.is_some_and(|presence| presence.connected_since_ms.is_some())
+    });
     let total = robots.len() as u64;
     robots.retain(|robot| query.after.as_ref().is_none_or(|after| robot.name > *after));
     robots.sort_by(|one, other| one.name.cmp(&other.name));
@@ -161,19 +169,33 @@ pub(in crate::http) async fn sessions(
         .get(limit.saturating_sub(1))
         .filter(|_| robots.len() > limit)
         .map(|last| last.name.clone());
+    robots.truncate(limit);
+    let is_elsewhere = |robot: &&KnownRobot| gauges.broker.traffic_of(&robot.id).is_none();
+    let elsewhere = robots.iter().filter(is_elsewhere).map(|robot| robot.id.clone()).collect();
+    let mut elsewhere = gauges.peers.sessions(elsewhere).await?;
     let session = |KnownRobot { id, name, .. }: KnownRobot| {
         let presence = gauges.presence.get(&id, now_ms)?;
+        let here = |traffic| SessionFigures {
+            subscriptions: gauges.broker.subscriptions_of(&id),
+            traffic,
+            node: gauges.peers.own_name().cloned(),
+        };
+        let SessionFigures { subscriptions, traffic, node } = match gauges.broker.traffic_of(&id) {
+            Some(traffic) => here(traffic),
+            None => elsewhere.remove(&id).unwrap_or_default(),
+        };
         Some(RobotSession {
             since_ms: presence.connected_since_ms?,
             address: presence.address_text(),
-            subscriptions: gauges.broker.subscriptions_of(&id),
-            traffic: gauges.broker.traffic_of(&id).unwrap_or_default(),
+            subscriptions,
+            traffic,
+            node,
             robot: id,
             name,
         })
     };
     // A robot that disconnected in the meantime is left out.
-    let sessions = robots.into_iter().take(limit).filter_map(session).collect();
+    let sessions = robots.into_iter().filter_map(session).collect();
     Ok(Json(SessionList { sessions, total, next }))
 }
 

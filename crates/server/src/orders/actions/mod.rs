@@ -6,6 +6,7 @@ mod deployments;
 mod error;
 mod expiry;
 mod idempotency;
+mod nodes;
 mod people;
 mod robots;
 mod selection;
@@ -26,6 +27,7 @@ pub use crate::store::TaskOrder;
 pub use deployments::{DeploymentActions, DeploymentError, Rollback};
 pub use error::OrderError;
 pub use idempotency::{IdempotencyKey, InvalidIdempotencyKey};
+pub use nodes::NodeActions;
 pub use people::{PAGE_LIFETIME_MS, PersonActions, PersonError, ProviderUser, SignedIn};
 pub use robots::{Enrolled, RobotActions, RobotError};
 pub use selection::SelectedRobot;
@@ -37,6 +39,7 @@ pub struct Actions {
     pub robots: RobotActions,
     pub deployments: DeploymentActions,
     pub people: PersonActions,
+    pub nodes: NodeActions,
 }
 
 /// Lifetimes the operator may set.
@@ -96,6 +99,7 @@ impl Actions {
                 )),
                 settings,
             },
+            nodes: NodeActions { store: store.clone(), clock: clock.clone() },
             people: PersonActions {
                 store: store.clone(),
                 clock: clock.clone(),

@@ -94,6 +94,8 @@ pub enum AuditAction {
     TokenCreate,
     /// An access token was revoked.
     TokenRevoke,
+    /// A server of the cluster was told to send its robots to the others.
+    NodeDrain,
 }
 
 impl AuditAction {
@@ -133,6 +135,7 @@ impl AuditAction {
             Self::SignInBlocked => "sign_in.blocked",
             Self::TokenCreate => "token.create",
             Self::TokenRevoke => "token.revoke",
+            Self::NodeDrain => "server.drain",
         }
     }
 }

@@ -11,9 +11,11 @@ mod publish;
 mod signed;
 mod uploads;
 
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+
 use axum::body::Body;
 use axum::extract::rejection::PathRejection;
-use axum::extract::{Path, Request, State};
+use axum::extract::{ConnectInfo, Path, Request, State};
 use axum::response::{IntoResponse, Response};
 use http::request::Parts;
 use http::{HeaderMap, HeaderValue, Method, StatusCode, Uri};
@@ -31,6 +33,7 @@ pub use publish::publish;
 use super::Registry;
 use crate::domain::person::Person;
 use crate::http::auth::Caller;
+use crate::http::peers::Patience;
 use crate::store::Reference;
 
 /// Error message for digests by an unsupported algorithm.
@@ -152,6 +155,13 @@ pub async fn dispatch(
         Endpoint::Uploads => Err(OciError::method("POST")),
         Endpoint::Upload(id) => {
             let id = id.parse().map_err(|_| OciError::upload_unknown())?;
+            if let Some(peer) = registry.peers.with_upload(&id, &parts.headers).await? {
+                let address = address(&parts, person);
+                let request = Request::from_parts(parts, body);
+                let forwarded = registry.peers.forward(&peer, Patience::UPLOAD, address, request);
+                // The client begins anew.
+                return forwarded.await.map_err(|_| OciError::upload_unknown());
+            }
             let upload = uploads::Upload { registry: &registry, repository: &repository, id };
             match method {
                 Method::GET => upload.status().await,
@@ -172,6 +182,15 @@ pub async fn dispatch(
             lists::referrers(&registry, &repository, subject, &parts).await
         }
     }
+}
+
+/// The address of the caller, as far as it is known.
+fn address(parts: &Parts, person: Option<&Person>) -> IpAddr {
+    let connection = || parts.extensions.get::<ConnectInfo<SocketAddr>>();
+    person
+        .and_then(|person| person.address)
+        .or_else(|| connection().map(|ConnectInfo(peer)| peer.ip()))
+        .unwrap_or(IpAddr::V4(Ipv4Addr::UNSPECIFIED))
 }
 
 /// Answers a request about the manifest that `text`, a tag or a digest, refers to.

@@ -195,9 +195,12 @@ async fn figures_are_those_of_all_servers() {
     assert_eq!((seen.robots.online, seen.mqtt.robots_connected), (1, 1));
     let own = seen.nodes[1].figures.expect("its own");
     assert_eq!(own.mqtt.robots_connected, 0, "the robot is at the other");
-    let sessions = two.get("/api/v1/server/sessions").await.expect("an answer");
-    let sessions: SessionList = serde_json::from_value(sessions).expect("a list");
-    assert_eq!(sessions.total, 1);
+    let sessions = eventually("the session to be listed", async || {
+        let sessions = two.get("/api/v1/server/sessions").await?;
+        let sessions: SessionList = serde_json::from_value(sessions).expect("a list");
+        (sessions.total == 1).then_some(sessions)
+    })
+    .await;
     assert!(!sessions.sessions[0].subscriptions.is_empty(), "{sessions:?}");
     assert!(sessions.sessions[0].traffic.messages_in > 0, "{sessions:?}");
     assert_eq!(sessions.sessions[0].node.as_ref().map(NodeName::as_str), Some("one"));

@@ -97,7 +97,6 @@ async fn order_at_one_node_reaches_a_robot_at_another() {
         a.robot(&robot.name).await?.online.then_some(())
     })
     .await;
-    assert_eq!(sessions(&a).await, Some(Vec::new()), "its session is at the other");
     a.push(&cluster.service("1.0.0"), "*").await;
     runs_soon(&a, &robot.name, "1.0.0").await;
     b.push(&cluster.service("2.0.0"), "*").await;
@@ -251,6 +250,16 @@ async fn batches_follow_each_other_over_two_nodes() {
     let is_assigned = |(_, phase): &&(u64, String)| phase == "assigned";
     assert_eq!(timelines[1].iter().filter(is_assigned).count(), 2, "{deployment}");
     assert!(timelines[1][1..].iter().all(|(at_ms, _)| at_ms >= first_runs_ms), "{deployment}");
+    // Both nodes have seen it all, and one of them tells.
+    let told = async |words: &str| {
+        let feed = a.get("/api/v1/feed").await?;
+        let texts = feed["entries"].as_array()?.iter().filter_map(|entry| entry["text"].as_str());
+        Some(texts.filter(|text| text.contains(words)).count()).filter(|count| *count > 0)
+    };
+    for words in ["was started on", "has settled"] {
+        let count = eventually_within(SOON, words, async || told(words).await).await;
+        assert_eq!(count, 1, "{words}");
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -41,6 +41,11 @@ pub(crate) struct ClusterDraft {
 }
 
 impl Config {
+    /// The directory with the cluster's keys.
+    pub fn secrets(&self) -> Option<PathBuf> {
+        self.cluster.as_ref()?.secrets.clone()
+    }
+
     /// The settings of the cluster, complete and without contradictions. Errors name the key in
     /// `file`, or else the variable.
     pub(super) fn finish_cluster(
@@ -117,7 +122,7 @@ mod tests {
             (&[POSTGRES], "[cluster]", "cluster.url in taskd.toml: missing"),
             (&[POSTGRES, ("TASKD_STANDBY", "true")], url, "standby in taskd.toml: a server of a"),
             (
-                &[POSTGRES, ("TASKD_BROKER", "mqtt://u:p@b")],
+                &[POSTGRES, ("TASKD_BROKER", "mqtts://u:p@b")],
                 url,
                 "broker in taskd.toml: the servers",
             ),

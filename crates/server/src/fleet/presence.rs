@@ -455,9 +455,13 @@ impl PresenceRecord {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Instant;
+
     use task_proto::Digest;
 
     use super::*;
+    use crate::fleet::live_nodes::LiveNodes;
+    use crate::fleet::sessions_elsewhere::SessionElsewhere;
 
     const MINUTE_MS: u64 = 60_000;
 
@@ -552,6 +556,35 @@ mod tests {
     }
 
     #[test]
+    fn copy_waits_while_the_original_is_at_another_server() {
+        let (nodes, robot, original, copy) =
+            (LiveNodes::default(), RobotId::random(), agent(1), agent(2));
+        let presence = Presence::new(1000, 0).share(SharedPresence::new(nodes.clone()));
+        nodes.join("a-1");
+        nodes.observe([("b-1", 1)], Instant::now());
+        let session = SessionElsewhere {
+            run: "b-1".into(),
+            since_ms: Some(5),
+            seen_ms: 5,
+            left_ms: None,
+            address: None,
+            agent: Some(original.clone()),
+            left_at: None,
+        };
+        let elsewhere = &presence.shared().expect("shared").elsewhere;
+        elsewhere.put(&robot, session.clone());
+        assert!(presence.is_online(&robot, 10) && presence.is_elsewhere(&robot, 10));
+        let polls = |agent: &AgentIdentity, now_ms| {
+            presence.identify(&robot, None, None, agent.clone(), now_ms).is_serving
+        };
+        assert!(!polls(&copy, 10) && !polls(&copy, 10 + 2 * HANDOVER_SILENCE_MS));
+        let left_ms = 10 * MINUTE_MS;
+        elsewhere.put(&robot, SessionElsewhere { left_ms: Some(left_ms), ..session });
+        assert!(!polls(&copy, left_ms + HANDOVER_SILENCE_MS - 1));
+        assert!(polls(&copy, left_ms + HANDOVER_SILENCE_MS), "like a restarted robot");
+    }
+
+    #[test]
     fn restart_in_the_same_place_serves_at_once() {
         let (presence, robot) = (Presence::new(1000, 0), RobotId::random());
         for now_ms in 0..5 {
@@ -560,7 +593,7 @@ mod tests {
         presence.remember(&robot, agent(2), 6);
         assert!(
             presence.identify(&robot, None, None, agent(1), 6).is_serving,
-            "the known state is newer"
+            "what is known is newer"
         );
     }
 

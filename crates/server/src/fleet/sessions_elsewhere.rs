@@ -4,14 +4,15 @@
 use std::collections::HashMap;
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use task_proto::RobotId;
 
 use super::live_nodes::LiveNodes;
 use super::robot_presence::{AgentIdentity, RobotPresence};
-use super::shared_presence::MOVE_TIME;
 
+/// A robot that comes back within this time, at any server, was not away.
+pub(super) const MOVE_TIME: Duration = Duration::from_secs(10);
 /// Maximum sessions in memory; those beyond the limit are not shown as online.
 const MAX_SESSIONS: usize = 2_000_000;
 
@@ -159,8 +160,6 @@ impl SessionsElsewhere {
 
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
-
     use super::*;
 
     #[test]

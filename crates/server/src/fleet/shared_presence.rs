@@ -11,10 +11,8 @@ use tokio::sync::Notify;
 
 use super::live_nodes::LiveNodes;
 use super::robot_presence::AgentIdentity;
-use super::sessions_elsewhere::SessionsElsewhere;
+use super::sessions_elsewhere::{MOVE_TIME, SessionsElsewhere};
 
-/// A robot that comes back within this time, at any server, was not away.
-pub const MOVE_TIME: Duration = Duration::from_secs(10);
 /// Additional time before a robot counts as away, in which its session at another server becomes
 /// known here.
 const NEWS_TIME: Duration = Duration::from_secs(3);

@@ -11,10 +11,12 @@ use task_proto::{DeploymentId, RobotId, RobotName};
 
 use crate::store::repositories::Feed;
 use crate::store::rows::{from_json, groups, json, number, stored, values};
-use crate::store::{KnownRobot, Store, StoreError};
+use crate::store::{KnownRobot, Store, StoreError, Transaction};
 
 /// The most entries kept.
 const MAX_KEPT: i64 = 1_000;
+/// Time within which another server of the cluster may have told the same about a deployment.
+const SAME_MS: u64 = 60_000;
 const COLUMN_TYPES: [&str; 4] = ["BIGINT", "BIGINT", "TEXT", "TEXT"];
 
 /// The users who may see an entry.
@@ -40,6 +42,14 @@ pub struct NewFeedEntry {
 }
 
 impl NewFeedEntry {
+    /// Whether another server has told the same about a deployment: each sees the reports of its own
+    /// robots, and all have the same deployments.
+    fn is_same(&self, known: &FeedEntry) -> bool {
+        self.deployment.is_some()
+            && (self.kind, &self.deployment, &self.text)
+                == (known.kind, &known.deployment, &known.text)
+    }
+
     fn numbered(&self, number: u64, at_ms: u64) -> FeedEntry {
         let Self { kind, level, robot, deployment, text, audience: _ } = self.clone();
         let (robot, robot_name) = robot.unzip();
@@ -85,7 +95,12 @@ impl Feed<&Store> {
             .fetch_one(write.connection())
             .await?;
         let first = last.map_or(0, |last| number(last) + 1).max(at_ms);
-        let numbered: Vec<_> = (first..).zip(entries).collect();
+        let known = match self.0.cluster_run() {
+            Some(_) => entries_since(&mut write, at_ms.saturating_sub(SAME_MS)).await?,
+            None => Vec::new(),
+        };
+        let new = entries.iter().filter(|new| !known.iter().any(|known| new.is_same(known)));
+        let numbered: Vec<_> = (first..).zip(new).collect();
         for group in groups(&numbered) {
             let sql = format!(
                 "INSERT INTO feed (number, at_ms, entry, audience) {}",
@@ -109,6 +124,14 @@ impl Feed<&Store> {
         .execute(write.connection())
         .await?;
         write.commit().await?;
-        Ok(first..=first + (entries.len() as u64).saturating_sub(1))
+        Ok(first..=first + (numbered.len() as u64).saturating_sub(1))
     }
+}
+
+async fn entries_since(write: &mut Transaction, at_ms: u64) -> Result<Vec<FeedEntry>, StoreError> {
+    let entries: Vec<String> = sqlx::query_scalar("SELECT entry FROM feed WHERE number >= $1")
+        .bind(stored(at_ms))
+        .fetch_all(write.connection())
+        .await?;
+    entries.iter().map(|entry| from_json("feed.entry", entry)).collect()
 }

@@ -10,10 +10,14 @@ use nix::unistd::Pid;
 use task_agent::ros::graph::process::program::MEMORY_BYTES;
 use task_agent::ros::graph::{Graph, GraphError, ParameterValue};
 use task_agent::ros::graph_access::GraphAccess;
+use task_agent::ros::readiness::Promise;
+use task_agent::ros::watcher::{WatchedRun, Watcher};
 use task_agent::system::layout::DataDir;
+use task_agent::task::observed::Health;
 use task_proto::messages::report::{FailureCode, RosFacts};
+use tokio::sync::watch;
 
-use crate::harness::{eventually, lives, within};
+use crate::harness::{self, eventually, lives, within};
 use crate::ros::{CALL, RosNode, name, open, program};
 use crate::rtps;
 
@@ -144,14 +148,7 @@ fn is_matched(
             rtps::heartbeat(prefix, rtps::PUBLICATIONS, 5, number),
         ],
     );
-    socket.set_read_timeout(Some(Duration::from_millis(100))).unwrap();
-    let mut bytes = [0; 65_536];
-    while let Ok(length) = socket.recv(&mut bytes) {
-        if rtps::kinds(&bytes[..length]).contains(&rtps::ACKNACK) {
-            return true;
-        }
-    }
-    false
+    rtps::is_asked(socket)
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -203,8 +200,7 @@ async fn localhost_only_graph_binds_to_loopback() {
     const DOMAIN: u16 = 101;
     let graph = open(DOMAIN).await;
     let sockets = std::fs::read_to_string("/proc/net/udp").unwrap();
-    let ports: Vec<u16> =
-        [0, 1].into_iter().chain(10..24).map(|port| 7400 + 250 * DOMAIN + port).collect();
+    let ports: Vec<u16> = rtps::all_ports(DOMAIN).collect();
     let bound: Vec<&str> = sockets
         .lines()
         .filter_map(|line| line.split_whitespace().nth(1)?.split_once(':'))
@@ -257,6 +253,32 @@ async fn killed_graph_process_is_restarted_with_its_subscriptions() {
     node.leave().await;
     drop(access);
     second.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn lost_graph_is_no_fault_of_a_watched_run() {
+    let temp = tempfile::tempdir().unwrap();
+    let data = DataDir::new(temp.path()).unwrap();
+    let access = GraphAccess::of_robot("02:00:00:00:00:03".parse().unwrap(), data, program());
+    let facts = facts(105);
+    let graph = access.open(Some(&facts)).await.unwrap();
+    let watcher = Watcher::new(access, harness::supervisor());
+    let promise = Promise { nodes: [name("/absent")].into(), ..Promise::default() };
+    let run = WatchedRun { dir: temp.path().to_owned(), ..WatchedRun::default() };
+    let mut health = watcher.watch(run, promise, Some(facts));
+    let shows = async |code: FailureCode, health: &mut watch::Receiver<Health>| {
+        let shown = health.wait_for(|health| match health {
+            Health::Missing(missing) => missing.code == code,
+            _ => false,
+        });
+        match &*within("the health", shown).await.unwrap() {
+            Health::Missing(missing) => missing.is_own_fault,
+            other => panic!("{other:?}"),
+        }
+    };
+    assert!(shows(FailureCode::NODE_VANISHED, &mut health).await);
+    signal(graph.pid(), Signal::SIGKILL);
+    assert!(!shows(FailureCode::GRAPH_UNAVAILABLE, &mut health).await);
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -12,6 +12,7 @@ mod fetch;
 mod flips;
 mod gate;
 mod graph;
+mod graph_network;
 mod graph_process;
 mod harness;
 mod init;

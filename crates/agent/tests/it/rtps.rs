@@ -1,6 +1,7 @@
 //! RTPS datagrams as an attacker writes them, and how much memory a process has.
 
 use std::net::{Ipv4Addr, SocketAddr, UdpSocket};
+use std::time::Duration;
 
 /// `DATA_FRAG`: states the size of the whole sample.
 pub fn data_frag(
@@ -39,6 +40,15 @@ pub fn gap(prefix: [u8; 12], endpoints: Endpoints, from: i64, to: i64) -> Vec<u8
     datagram(prefix, 0x08, &body)
 }
 
+/// The locator of a port of loopback.
+fn loopback(port: u16) -> Vec<u8> {
+    let mut locator = 1_u32.to_le_bytes().to_vec();
+    locator.extend(u32::from(port).to_le_bytes());
+    locator.extend([0; 12]);
+    locator.extend(Ipv4Addr::LOCALHOST.octets());
+    locator
+}
+
 /// The announcement of a participant that listens at `at`.
 pub fn announcement(prefix: [u8; 12], number: u32, at: u16) -> Vec<u8> {
     let mut parameters = vec![0, 3, 0, 0];
@@ -49,10 +59,7 @@ pub fn announcement(prefix: [u8; 12], number: u32, at: u16) -> Vec<u8> {
     };
     let mut guid = prefix.to_vec();
     guid.extend([0, 0, 1, 0xc1]);
-    let mut locator = 1_u32.to_le_bytes().to_vec();
-    locator.extend(u32::from(at).to_le_bytes());
-    locator.extend([0; 12]);
-    locator.extend(Ipv4Addr::LOCALHOST.octets());
+    let locator = loopback(at);
     parameter(0x0015, &[2, 4, 0, 0]);
     parameter(0x0016, &[1, 0x0f, 0, 0]);
     parameter(0x0050, &guid);
@@ -102,10 +109,10 @@ fn datagram(prefix: [u8; 12], kind: u8, body: &[u8]) -> Vec<u8> {
 }
 
 /// The kind of the submessage by which a reader asks for samples.
-pub const ACKNACK: u8 = 0x06;
+const ACKNACK: u8 = 0x06;
 
 /// The kinds of a datagram's submessages.
-pub fn kinds(datagram: &[u8]) -> Vec<u8> {
+fn kinds(datagram: &[u8]) -> Vec<u8> {
     let mut kinds = Vec::new();
     let mut rest = datagram.get(20..).unwrap_or_default();
     while let [kind, _, low, high, behind @ ..] = rest {
@@ -118,6 +125,23 @@ pub fn kinds(datagram: &[u8]) -> Vec<u8> {
 /// The ports of the first participant of this domain: for discovery and for user traffic.
 fn ports(domain_id: u16) -> [u16; 2] {
     [10, 11].map(|port| 7400 + 250 * domain_id + port)
+}
+
+/// The ports of all participants of this domain on a host, and of their multicast group.
+pub fn all_ports(domain_id: u16) -> impl Iterator<Item = u16> {
+    [0, 1].into_iter().chain(10..24).map(move |port| 7400 + 250 * domain_id + port)
+}
+
+/// Whether a datagram that asks for samples arrives within a moment.
+pub fn is_asked(socket: &UdpSocket) -> bool {
+    socket.set_read_timeout(Some(Duration::from_millis(100))).expect("a time limit");
+    let mut bytes = [0; 65_536];
+    while let Ok(length) = socket.recv(&mut bytes) {
+        if kinds(&bytes[..length]).contains(&ACKNACK) {
+            return true;
+        }
+    }
+    false
 }
 
 /// Sends each of these to the first participant of this domain on this host. The others have

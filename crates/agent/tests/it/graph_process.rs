@@ -196,6 +196,30 @@ async fn packets_with_full_sequence_ranges_cost_no_time_or_memory() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn info_reply_directs_no_packet_to_another_address() {
+    const DOMAIN: u16 = 104;
+    let graph = open(DOMAIN).await;
+    let attack = || {
+        let [own, other] = [(); 2].map(|()| UdpSocket::bind("127.0.0.1:0").unwrap());
+        let [port, other_port] = [&own, &other].map(|socket| socket.local_addr().unwrap().port());
+        let prefix = *b"\x01\x0fattacker\0\0";
+        assert!((1..300).any(|number| is_matched(&own, DOMAIN, prefix, number, port)));
+        let is_answered = |count| {
+            let heartbeat = rtps::heartbeat(prefix, rtps::PUBLICATIONS, 5, count);
+            // RustDDS 0.15.1 expects the tag of a list of multicast locators; the standard has none.
+            let rest: &[u8] = if count % 2 == 0 { &[0; 4] } else { &[] };
+            rtps::send(&own, DOMAIN, [rtps::with_info_reply(other_port, rest, &heartbeat)]);
+            rtps::is_asked(&own)
+        };
+        let answered = (1_001..1_041).filter(|count| is_answered(*count)).count();
+        assert!(answered > 30, "{answered} of 40 replies came to the announced address");
+        assert!(!rtps::is_asked(&other), "a reply went to an address that was not announced");
+    };
+    tokio::task::spawn_blocking(attack).await.unwrap();
+    graph.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn localhost_only_graph_binds_to_loopback() {
     const DOMAIN: u16 = 101;
     let graph = open(DOMAIN).await;

@@ -40,6 +40,17 @@ pub fn gap(prefix: [u8; 12], endpoints: Endpoints, from: i64, to: i64) -> Vec<u8
     datagram(prefix, 0x08, &body)
 }
 
+/// `INFO_REPLY` before the submessages of `datagram`: asks for replies to this port of loopback.
+/// `rest` follows the list of locators.
+pub fn with_info_reply(port: u16, rest: &[u8], datagram: &[u8]) -> Vec<u8> {
+    let (header, submessages) = datagram.split_at(20);
+    let mut reply = 1_u32.to_le_bytes().to_vec();
+    reply.extend(loopback(port));
+    reply.extend(rest);
+    let length = u16::try_from(reply.len()).expect("short").to_le_bytes();
+    [header, &[0x0f, 1], &length, &reply, submessages].concat()
+}
+
 /// The locator of a port of loopback.
 fn loopback(port: u16) -> Vec<u8> {
     let mut locator = 1_u32.to_le_bytes().to_vec();

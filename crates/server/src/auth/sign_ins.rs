@@ -1,9 +1,9 @@
-//! Limits failed password sign-ins per account and per address. If an account has recently signed
-//! in from an address, the pair of both has a separate count, and no other count applies to it. So
+//! Limits failed password sign-ins per account and per network. If an account has recently signed
+//! in from a network, the pair of both has a separate count, and no other count applies to it. So
 //! neither strangers elsewhere nor neighbours behind the same address can lock the account's owner
 //! out. Every attempt counts as failed until it has succeeded, so concurrent attempts all count.
-//! The windows of names are kept by the caller; everything else is in memory, which is bounded.
-//! This module never sees a password.
+//! The caller keeps the windows of names and the familiar networks; everything else is in memory,
+//! which is bounded. This module never sees a password.
 
 use std::collections::HashMap;
 use std::hash::Hash;
@@ -26,20 +26,34 @@ const MAX_FOR_NAME: u64 = 10;
 const MAX_FROM_ADDRESS: u64 = 50;
 /// Maximum counts of each kind.
 const MAX_COUNTS: usize = 8_192;
-/// Maximum familiar pairs of account and address.
-const MAX_FAMILIAR: usize = 8_192;
+/// Maximum familiar networks of one account.
+pub const MAX_FAMILIAR: u32 = 32;
 
 #[derive(Debug, Default)]
 pub struct SignInLimiter(Mutex<Counts>);
 
 #[derive(Debug, Default)]
 struct Counts {
-    addresses: Windows<IpAddr>,
+    networks: Windows<Network>,
     /// Attempts of which only the address is known. Wrong passwords don't count here, and these
     /// attempts don't count as wrong passwords.
-    anonymous: Windows<IpAddr>,
-    pairs: Windows<(UserName, IpAddr)>,
-    familiar: HashMap<(UserName, IpAddr), u64>,
+    anonymous: Windows<Network>,
+    pairs: Windows<(UserName, Network)>,
+}
+
+/// The addresses that count as one: the owner of one IPv6 address has 2^64 of them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Network(IpAddr);
+
+impl From<IpAddr> for Network {
+    fn from(address: IpAddr) -> Self {
+        Self(match address.to_canonical() {
+            IpAddr::V6(address) => {
+                IpAddr::V6(Ipv6Addr::from_bits(address.to_bits() & !u128::from(u64::MAX)))
+            }
+            address => address,
+        })
+    }
 }
 
 /// Further attempts are refused for a while.
@@ -51,12 +65,12 @@ pub struct Blocked {
     pub is_first: bool,
 }
 
-/// Whether the account has recently signed in from the address of an attempt.
+/// Whether the account has recently signed in from the network of an attempt.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Familiarity {
     /// The attempt counts for the pair of both alone.
     Familiar,
-    /// The attempt counts for the address and for the name.
+    /// The attempt counts for the network and for the name.
     Unfamiliar,
 }
 
@@ -67,16 +81,34 @@ pub struct NameDigest(String);
 
 impl NameDigest {
     pub fn of(name: &UserName, key: &SigningKey) -> Self {
-        let mut mac =
-            Hmac::<Sha256>::new_from_slice(&key.to_bytes()).expect("HMAC takes keys of any length");
-        mac.update(b"name at a sign-in ");
-        mac.update(name.as_str().as_bytes());
-        Self(hex(&mac.finalize().into_bytes()))
+        Self(keyed_digest(key, &format!("name at a sign-in {name}")))
     }
 
     pub fn as_str(&self) -> &str {
         &self.0
     }
+}
+
+/// An account and a network from which it has signed in, in the form that is stored: 64 hex digits,
+/// so that the database keeps no list of the places of people.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct NetworkDigest(String);
+
+impl NetworkDigest {
+    pub fn of(user: &UserName, network: Network, key: &SigningKey) -> Self {
+        Self(keyed_digest(key, &format!("network of a sign-in {} {user}", network.0)))
+    }
+
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+fn keyed_digest(key: &SigningKey, text: &str) -> String {
+    let mut mac =
+        Hmac::<Sha256>::new_from_slice(&key.to_bytes()).expect("HMAC takes keys of any length");
+    mac.update(text.as_bytes());
+    hex(&mac.finalize().into_bytes())
 }
 
 impl SignInLimiter {
@@ -85,76 +117,47 @@ impl SignInLimiter {
     pub fn begin(
         &self,
         user: &UserName,
-        address: IpAddr,
+        network: Network,
+        familiarity: Familiarity,
         now_ms: u64,
-    ) -> Result<Familiarity, Blocked> {
-        let address = network(address);
+    ) -> Result<(), Blocked> {
         let mut counts = self.lock();
-        let pair = (user.clone(), address);
-        if counts.familiar.contains_key(&pair) {
-            counts.pairs.count(pair, MAX_FOR_NAME, now_ms)?;
-            return Ok(Familiarity::Familiar);
+        match familiarity {
+            Familiarity::Familiar => {
+                counts.pairs.count((user.clone(), network), MAX_FOR_NAME, now_ms)
+            }
+            Familiarity::Unfamiliar => counts.networks.count(network, MAX_FROM_ADDRESS, now_ms),
         }
-        counts.addresses.count(address, MAX_FROM_ADDRESS, now_ms)?;
-        Ok(Familiarity::Unfamiliar)
     }
 
     /// Counts an attempt of which only the address is known, before it is made.
     pub fn begin_anonymous(&self, address: IpAddr, now_ms: u64) -> Result<(), Blocked> {
-        self.lock().anonymous.count(network(address), MAX_FROM_ADDRESS, now_ms)
+        self.lock().anonymous.count(address.into(), MAX_FROM_ADDRESS, now_ms)
     }
 
     /// The unnamed attempt has succeeded.
     pub fn anonymous_succeeded(&self, address: IpAddr) {
-        self.lock().anonymous.decrement(&network(address));
+        self.lock().anonymous.decrement(&address.into());
     }
 
-    /// The end of the block for unfamiliar names at the address. A wrong password for a familiar
+    /// The end of the block for unfamiliar names at the network. A wrong password for a familiar
     /// name gets the same answer, so that an attacker can't learn which names are familiar.
-    pub fn blocked_at(&self, address: IpAddr, now_ms: u64) -> Option<Blocked> {
-        self.lock().addresses.active_block(&network(address), MAX_FROM_ADDRESS, now_ms)
+    pub fn blocked_at(&self, network: Network, now_ms: u64) -> Option<Blocked> {
+        self.lock().networks.active_block(&network, MAX_FROM_ADDRESS, now_ms)
     }
 
-    /// The attempt has succeeded: it no longer counts, and the address is now familiar for the
-    /// account.
-    pub fn succeeded(
-        &self,
-        user: &UserName,
-        address: IpAddr,
-        familiarity: Familiarity,
-        now_ms: u64,
-    ) {
-        let pair = (user.clone(), network(address));
+    /// The attempt has succeeded or was not made after all: it no longer counts.
+    pub fn uncount(&self, user: &UserName, network: Network, familiarity: Familiarity) {
         let mut counts = self.lock();
-        counts.decrement(&pair, familiarity);
-        if counts.familiar.len() >= MAX_FAMILIAR && !counts.familiar.contains_key(&pair) {
-            let oldest = counts
-                .familiar
-                .iter()
-                .min_by_key(|(_, since_ms)| **since_ms)
-                .map(|(pair, _)| pair.clone());
-            oldest.map(|oldest| counts.familiar.remove(&oldest));
+        match familiarity {
+            Familiarity::Familiar => counts.pairs.decrement(&(user.clone(), network)),
+            Familiarity::Unfamiliar => counts.networks.decrement(&network),
         }
-        counts.familiar.insert(pair, now_ms);
-    }
-
-    /// The attempt was not made after all.
-    pub fn cancelled(&self, user: &UserName, address: IpAddr, familiarity: Familiarity) {
-        self.lock().decrement(&(user.clone(), network(address)), familiarity);
     }
 
     fn lock(&self) -> MutexGuard<'_, Counts> {
         // Every change under this lock is complete in itself.
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
-impl Counts {
-    fn decrement(&mut self, pair: &(UserName, IpAddr), familiarity: Familiarity) {
-        match familiarity {
-            Familiarity::Familiar => self.pairs.decrement(pair),
-            Familiarity::Unfamiliar => self.addresses.decrement(&pair.1),
-        }
     }
 }
 
@@ -246,16 +249,6 @@ impl<K: Eq + Hash> Windows<K> {
     }
 }
 
-/// The network that counts as one address: the owner of one IPv6 address has 2^64 of them.
-fn network(address: IpAddr) -> IpAddr {
-    match address.to_canonical() {
-        IpAddr::V6(address) => {
-            IpAddr::V6(Ipv6Addr::from_bits(address.to_bits() & !u128::from(u64::MAX)))
-        }
-        address => address,
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -266,20 +259,25 @@ mod tests {
         name.parse().expect("a name")
     }
 
-    fn address(n: u8) -> IpAddr {
-        IpAddr::from([10, 0, 0, n])
+    fn network(n: u8) -> Network {
+        IpAddr::from([10, 0, 0, n]).into()
     }
 
-    /// The limiter, and the window of one account as its caller keeps it.
+    /// The limiter, and what its caller keeps of one account.
     #[derive(Default)]
     struct Account {
         sign_ins: SignInLimiter,
         window: Option<Window>,
+        familiar: Vec<Network>,
     }
 
     impl Account {
-        fn begin(&mut self, address: IpAddr, now_ms: u64) -> Result<Familiarity, Blocked> {
-            let familiarity = self.sign_ins.begin(&user("alice"), address, now_ms)?;
+        fn begin(&mut self, network: Network, now_ms: u64) -> Result<Familiarity, Blocked> {
+            let familiarity = match self.familiar.contains(&network) {
+                true => Familiarity::Familiar,
+                false => Familiarity::Unfamiliar,
+            };
+            self.sign_ins.begin(&user("alice"), network, familiarity, now_ms)?;
             if familiarity == Familiarity::Unfamiliar {
                 let window = Window::with_attempt(self.window, now_ms);
                 self.window = Some(window);
@@ -288,35 +286,41 @@ mod tests {
             Ok(familiarity)
         }
 
-        fn sign_in(&mut self, address: IpAddr, now_ms: u64) {
-            let familiarity = self.begin(address, now_ms).expect("allowed");
-            self.sign_ins.succeeded(&user("alice"), address, familiarity, now_ms);
+        fn sign_in(&mut self, network: Network, now_ms: u64) {
+            let familiarity = self.begin(network, now_ms).expect("allowed");
+            self.sign_ins.uncount(&user("alice"), network, familiarity);
             if familiarity == Familiarity::Unfamiliar {
                 self.window = self.window.map(Window::without_attempt);
             }
+            self.familiar.push(network);
         }
+    }
+
+    /// An attempt for an account that is unfamiliar at the network.
+    fn begin(sign_ins: &SignInLimiter, name: &str, network: Network) -> Result<(), Blocked> {
+        sign_ins.begin(&user(name), network, Familiarity::Unfamiliar, NOW_MS)
     }
 
     #[test]
     fn account_is_blocked_for_strangers_and_not_for_its_owner() {
         let mut alice = Account::default();
-        alice.sign_in(address(1), NOW_MS);
+        alice.sign_in(network(1), NOW_MS);
         for n in 0..MAX_FOR_NAME {
             assert_eq!(alice.window.and_then(|window| window.name_block(NOW_MS)), None);
-            alice.begin(address(100 + n as u8), NOW_MS).expect("allowed");
+            alice.begin(network(100 + n as u8), NOW_MS).expect("allowed");
         }
         let until_ms = NOW_MS + WINDOW_MS;
         let blocked = |is_first| Blocked { until_ms, is_first };
-        assert_eq!(alice.begin(address(99), NOW_MS + 1), Err(blocked(true)));
-        assert_eq!(alice.begin(address(98), NOW_MS + 1), Err(blocked(false)));
+        assert_eq!(alice.begin(network(99), NOW_MS + 1), Err(blocked(true)));
+        assert_eq!(alice.begin(network(98), NOW_MS + 1), Err(blocked(false)));
         let window = alice.window.expect("attempts were counted");
         assert_eq!(window.name_block(NOW_MS + 1), Some(blocked(false)));
         for _ in 0..MAX_FOR_NAME {
-            alice.begin(address(1), NOW_MS + 2).expect("the owner's address has its own count");
+            alice.begin(network(1), NOW_MS + 2).expect("the owner's address has its own count");
         }
-        assert!(alice.begin(address(1), NOW_MS + 2).is_err());
+        assert!(alice.begin(network(1), NOW_MS + 2).is_err());
         assert_eq!(window.name_block(until_ms), None);
-        assert_eq!(alice.begin(address(99), until_ms), Ok(Familiarity::Unfamiliar));
+        assert_eq!(alice.begin(network(99), until_ms), Ok(Familiarity::Unfamiliar));
         assert_eq!(alice.window, Some(Window { began_ms: until_ms, count: 1 }));
     }
 
@@ -324,40 +328,39 @@ mod tests {
     fn address_is_blocked_across_all_names() {
         let sign_ins = SignInLimiter::default();
         for n in 0..MAX_FROM_ADDRESS {
-            sign_ins.begin(&user(&format!("user{n}")), address(1), NOW_MS).expect("allowed");
+            begin(&sign_ins, &format!("user{n}"), network(1)).expect("allowed");
         }
-        assert!(sign_ins.begin(&user("alice"), address(1), NOW_MS).is_err());
-        assert!(sign_ins.begin(&user("alice"), address(2), NOW_MS).is_ok());
+        assert!(begin(&sign_ins, "alice", network(1)).is_err());
+        assert!(begin(&sign_ins, "alice", network(2)).is_ok());
         // Neighbours in one IPv6 network count as one, and an IPv4 address stays the same when
         // mapped into IPv6.
-        let six = |text: &str| network(text.parse().expect("an address"));
+        let six = |text: &str| Network::from(text.parse::<IpAddr>().expect("an address"));
         assert_eq!(six("2001:db8::1"), six("2001:db8::ffff:1:2"));
         assert_ne!(six("2001:db8::1"), six("2001:db8:0:1::1"));
-        assert_eq!(six("::ffff:10.0.0.1"), address(1));
+        assert_eq!(six("::ffff:10.0.0.1"), network(1));
     }
 
     #[test]
     fn account_known_at_an_address_is_not_blocked_by_its_neighbours() {
         let mut alice = Account::default();
-        alice.sign_in(address(1), NOW_MS);
-        assert_eq!(alice.sign_ins.blocked_at(address(1), NOW_MS), None);
+        alice.sign_in(network(1), NOW_MS);
+        assert_eq!(alice.sign_ins.blocked_at(network(1), NOW_MS), None);
         for n in 0..=MAX_FROM_ADDRESS {
-            let _ = alice.sign_ins.begin(&user(&format!("user{n}")), address(1), NOW_MS);
+            let _ = begin(&alice.sign_ins, &format!("user{n}"), network(1));
         }
-        let blocked =
-            alice.sign_ins.begin(&user("ghost"), address(1), NOW_MS).expect_err("blocked");
+        let blocked = begin(&alice.sign_ins, "ghost", network(1)).expect_err("blocked");
         for _ in 0..MAX_FOR_NAME {
-            alice.begin(address(1), NOW_MS).expect("she is known there");
+            alice.begin(network(1), NOW_MS).expect("she is known there");
         }
         assert_eq!(
-            alice.sign_ins.blocked_at(address(1), NOW_MS),
+            alice.sign_ins.blocked_at(network(1), NOW_MS),
             Some(blocked),
             "her failures are told like theirs"
         );
-        assert_eq!(alice.sign_ins.blocked_at(address(1), NOW_MS + WINDOW_MS), None);
+        assert_eq!(alice.sign_ins.blocked_at(network(1), NOW_MS + WINDOW_MS), None);
         alice
             .sign_ins
-            .begin_anonymous(address(1), NOW_MS)
+            .begin_anonymous(IpAddr::from([10, 0, 0, 1]), NOW_MS)
             .expect("the provider's sign-ins are counted apart");
     }
 
@@ -365,11 +368,10 @@ mod tests {
     fn successful_and_cancelled_attempts_do_not_count() {
         let mut alice = Account::default();
         for n in 0..10 * MAX_FROM_ADDRESS {
-            let from = address(n as u8);
+            let from = network(n as u8);
             alice.sign_in(from, NOW_MS);
-            let name = user("bob");
-            let familiarity = alice.sign_ins.begin(&name, from, NOW_MS).expect("allowed");
-            alice.sign_ins.cancelled(&name, from, familiarity);
+            begin(&alice.sign_ins, "bob", from).expect("allowed");
+            alice.sign_ins.uncount(&user("bob"), from, Familiarity::Unfamiliar);
         }
         assert_eq!(alice.window.expect("it was used").count, 0);
     }
@@ -399,14 +401,11 @@ mod tests {
     fn many_names_and_addresses_take_no_more_memory() {
         let sign_ins = SignInLimiter::default();
         for n in 0..2 * MAX_COUNTS as u32 {
-            let (name, from) = (user(&format!("u{n}")), IpAddr::from(n.to_be_bytes()));
-            let _ = sign_ins.begin(&name, from, NOW_MS);
-            let at_ms = NOW_MS + u64::from(n);
-            sign_ins.succeeded(&name, from, Familiarity::Unfamiliar, at_ms);
+            let from = Network::from(IpAddr::from(n.to_be_bytes()));
+            let _ = begin(&sign_ins, &format!("u{n}"), from);
+            let _ = sign_ins.begin(&user("alice"), from, Familiarity::Familiar, NOW_MS);
         }
-        let counts = sign_ins.lock();
-        assert!(
-            counts.addresses.counts.len() <= MAX_COUNTS && counts.familiar.len() <= MAX_FAMILIAR
-        );
+        let Counts { networks, pairs, .. } = &*sign_ins.lock();
+        assert!(networks.counts.len() <= MAX_COUNTS && pairs.counts.len() <= MAX_COUNTS);
     }
 }

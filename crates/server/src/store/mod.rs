@@ -62,7 +62,7 @@ pub use orders::idempotency::IdempotencyRecord;
 pub use orders::past_assignments::{PreviousPackage, UnsuccessfulRobot};
 pub use orders::revert::Revocable;
 pub use orders::still_running::StillRunning;
-use people::audit::new_self_service_limit;
+use people::audit::new_audit_limit;
 pub use people::audit::{AuditAction, AuditEvent};
 use people::auth_cache::{AuthCache, InvalidationGuard};
 use people::first_use::FirstUses;
@@ -105,7 +105,7 @@ pub struct Store {
     cluster_writes: ConnectionPool,
     auth_cache: AuthCache,
     first_uses: FirstUses,
-    self_service_limit: Arc<KeyedRateLimit>,
+    audit_limit: Arc<KeyedRateLimit>,
     state: DatabaseState,
     url: Arc<str>,
     is_postgres: bool,
@@ -302,7 +302,7 @@ pub struct Transaction {
     /// The person whose rights this write has checked.
     verified_person: Option<Person>,
     /// The rate limit for acts that every person may do.
-    self_service_limit: Arc<KeyedRateLimit>,
+    audit_limit: Arc<KeyedRateLimit>,
 }
 
 impl Transaction {
@@ -407,7 +407,7 @@ impl Store {
             cluster_writes: ConnectionPool::new(cluster_pool_options(url, &state)),
             auth_cache: AuthCache::default(),
             first_uses: FirstUses::default(),
-            self_service_limit: Arc::new(new_self_service_limit()),
+            audit_limit: Arc::new(new_audit_limit()),
             state,
             url: url.into(),
             is_postgres: is_postgres(url),
@@ -585,13 +585,13 @@ impl Store {
             return Err(StoreError::TakenOver { successor });
         };
         let invalidation = self.auth_cache.invalidation_guard();
-        let self_service_limit = self.self_service_limit.clone();
+        let audit_limit = self.audit_limit.clone();
         Ok(Transaction {
             connection,
             sequence: rows::number(sequence),
             invalidation,
             verified_person: None,
-            self_service_limit,
+            audit_limit,
         })
     }
 }
@@ -647,6 +647,11 @@ mod tests {
             .collect();
         assert_eq!(modes, [0o600; 3], "the database, its log and the index of that");
         store.close().await;
+        let (link, target) = (directory.path().join("link"), directory.path().join("target"));
+        std::os::unix::fs::symlink(&target, &link).expect("a link");
+        Store::open(&sqlite_url(&link)).await.expect("opens").close().await;
+        let mode = target.metadata().expect("there").permissions().mode();
+        assert_eq!(mode & 0o777, 0o600, "the target of a link");
     }
 
     #[test]

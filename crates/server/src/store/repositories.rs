@@ -60,6 +60,8 @@ repositories! {
     page_sessions: PageSessions;
     /// Wrong passwords of accounts.
     sign_in_failures: SignInFailures;
+    /// Networks from which people have signed in.
+    familiar_networks: FamiliarNetworks;
     /// The audit log: who changed what, in a chain of hashes.
     audit: Audit;
     /// Manifests in the registry's repositories.

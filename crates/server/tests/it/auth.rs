@@ -226,6 +226,10 @@ async fn session_has_the_rights_of_its_token_on_its_own_page_only() {
     assert_eq!(refusal(wrong).await, (401, "unauthorized".to_owned()));
     let foreign = sign_in("http://evil.example", server.operator.reveal());
     assert_eq!(refusal(foreign).await, (403, "forbidden".to_owned()));
+    let token = json!({ "token": server.operator.reveal() });
+    let marked =
+        server.bare(Method::POST, "/api/v1/session").header("sec-fetch-site", "cross-site");
+    assert_eq!(refusal(marked.json(&token)).await, (403, "forbidden".to_owned()));
     let robot = server.enroll("atlas").await;
     assert_eq!(refusal(sign_in(&origin, robot.token)).await, (401, "unauthorized".to_owned()));
 

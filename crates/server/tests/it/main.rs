@@ -28,6 +28,7 @@ mod enrollments;
 mod feed;
 mod fleet;
 mod full_disk;
+mod growth;
 mod guard;
 mod harness;
 mod headers;

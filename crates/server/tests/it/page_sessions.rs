@@ -23,6 +23,7 @@ on_both_databases! {
     page_session_survives_a_restart,
     signed_out_session_is_refused_after_a_restart,
     sign_in_limit_holds_over_a_restart,
+    familiar_account_is_not_blocked_by_its_neighbours_after_a_restart,
     demoted_users_session_loses_its_rights_at_once,
     removed_users_session_ends_at_once,
     expired_session_is_refused,
@@ -136,6 +137,25 @@ async fn sign_in_limit_holds_over_a_restart(database: TestDatabase) {
     assert_eq!(status(log_in(&server, "bob", PASSWORD)).await, 201);
     server.clock.advance_ms(WINDOW_MS);
     assert_eq!(status(log_in(&server, "alice", PASSWORD)).await, 201);
+}
+
+async fn familiar_account_is_not_blocked_by_its_neighbours_after_a_restart(database: TestDatabase) {
+    let server = new_server(&database).await;
+    for name in ["alice", "bob"] {
+        add_user(&server, name, "viewer").await;
+    }
+    sign_in_as(&server, "alice").await;
+    let server = restart(&database, server).await;
+    let log_in = |name: &str, password: &str| {
+        let request = server.bare(Method::POST, "/api/v1/login");
+        request.json(&json!({ "user": name, "password": password }))
+    };
+    for n in 0..50 {
+        assert_eq!(refusal(log_in(&format!("nobody{n}"), "wrong")).await.0, 401);
+    }
+    assert_eq!(refusal(log_in("bob", PASSWORD)).await.0, 429, "he was never here");
+    assert_eq!(refusal(log_in("alice", "wrong")).await.0, 429, "no answer tells that she was");
+    assert_eq!(status(log_in("alice", PASSWORD)).await, 201);
 }
 
 async fn demoted_users_session_loses_its_rights_at_once(database: TestDatabase) {

@@ -87,7 +87,7 @@ impl Fleet {
         }
     }
 
-    async fn signed_in(&self, who: &str) -> Person {
+    pub async fn signed_in(&self, who: &str) -> Person {
         let token = self.sign_in(who, PASSWORD, HERE).await.expect("signed in");
         self.person(&token).await.expect("good")
     }
@@ -100,7 +100,7 @@ impl Fleet {
         self.robots.edit(&self.operator, &robot.id, &edit).await.expect("edited");
     }
 
-    async fn audit(&self) -> Vec<AuditEntry> {
+    pub async fn audit(&self) -> Vec<AuditEntry> {
         let query = AuditQuery { after: Some(0), ..AuditQuery::default() };
         let page = self.database.store.audit().page(&query).await.expect("reads");
         verified(&page).expect("holds");

@@ -9,12 +9,13 @@ use serde_json::{Value, json};
 use task_proto::messages::report::Phase;
 use task_proto::messages::topic::RobotTopic;
 use tempfile::TempDir;
-use tokio::net::TcpStream;
+use tokio::io::AsyncReadExt as _;
+use tokio::net::{TcpListener, TcpStream};
 
-use crate::database;
 use crate::harness::{TestRobot, TestServer, answer};
 use crate::mqtt_harness::{Connect, Raw, publish, topic};
 use crate::postgres_cluster::Postgres;
+use crate::{database, postgres_cluster};
 
 const PATIENCE: Duration = Duration::from_secs(30);
 
@@ -93,6 +94,37 @@ async fn server_waits_for_an_unreachable_database_at_start() {
     .await;
     server.enroll("atlas").await;
     eventually("/readyz says so", async || database(&server).await.0 == StatusCode::OK).await;
+    server.stop().await;
+}
+
+/// A balancer closes each connection for which it has no server.
+#[tokio::test(flavor = "multi_thread")]
+async fn server_waits_for_a_database_behind_a_balancer() {
+    let postgres = Postgres::create();
+    let listener = TcpListener::bind("127.0.0.1:0").await.expect("listens");
+    let url = postgres_cluster::url(listener.local_addr().expect("an address").port());
+    let port = postgres.port;
+    tokio::spawn(async move {
+        while let Ok((mut client, _)) = listener.accept().await {
+            tokio::spawn(async move {
+                match TcpStream::connect(("127.0.0.1", port)).await {
+                    Ok(mut server) => {
+                        let _ = tokio::io::copy_bidirectional(&mut client, &mut server).await;
+                    }
+                    // A socket that closes with unread bytes would reset the connection.
+                    Err(_) => drop(client.read(&mut [0; 64]).await),
+                }
+            });
+        }
+    });
+    let directory = TempDir::new().expect("a directory");
+    let server = TestServer::start_in(directory, |config| config.database = Some(url)).await;
+    assert_away(&server).await;
+    postgres.start();
+    eventually("/readyz says so", async || database(&server).await.0 == StatusCode::OK).await;
+    server.enroll("atlas").await;
+    assert!(postgres.stop(), "it does not stop");
+    assert_away(&server).await;
     server.stop().await;
 }
 

@@ -17,12 +17,12 @@ use crate::{
     submessage::{ReaderSubmessage, WriterSubmessage},
     submessage_flag::{
       endianness_flag, ACKNACK_Flags, DATAFRAG_Flags, DATA_Flags, GAP_Flags, HEARTBEATFRAG_Flags,
-      HEARTBEAT_Flags, INFODESTINATION_Flags, INFOREPLY_Flags, INFOSOURCE_Flags,
+      HEARTBEAT_Flags, INFODESTINATION_Flags, INFOSOURCE_Flags,
       INFOTIMESTAMP_Flags, NACKFRAG_Flags,
     },
     submessage_header::SubmessageHeader,
     submessage_kind::SubmessageKind,
-    submessages::{Data, DataFrag, Gap, HeartbeatFrag, InfoReply, InterpreterSubmessage},
+    submessages::{Data, DataFrag, Gap, HeartbeatFrag, InterpreterSubmessage},
   },
   Timestamp,
 };
@@ -223,13 +223,9 @@ impl Submessage {
           f,
         ))
       }
-      SubmessageKind::INFO_REPLY => {
-        let f = BitFlags::<INFOREPLY_Flags>::from_bits_truncate(sub_header.flags);
-        mk_i_subm(InterpreterSubmessage::InfoReply(
-          InfoReply::read_from_buffer_with_ctx(e, &sub_content_buffer)?,
-          f,
-        ))
-      }
+      // Any sender could direct our replies to any address with it. They go to the
+      // locators of the matched Writer instead.
+      SubmessageKind::INFO_REPLY => Ok(None),
       SubmessageKind::PAD => {
         Ok(None) // nothing to do here
       }

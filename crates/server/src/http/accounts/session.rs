@@ -17,7 +17,7 @@ use task_proto::{Digest, UserName};
 use super::person_sessions::PersonSessions;
 use crate::auth::oidc::Provider;
 use crate::domain::person::Person;
-use crate::http::auth::{COOKIE, require_same_origin, session_digest};
+use crate::http::auth::{COOKIE, is_from_browser_page, require_same_origin, session_digest};
 use crate::http::error::ApiError;
 use crate::http::extract::JsonBody;
 use crate::orders::actions::{PAGE_LIFETIME_MS, PersonActions};
@@ -108,9 +108,9 @@ pub(in crate::http) async fn sign_in(
     headers: HeaderMap,
     JsonBody(request): JsonBody<SignIn>,
 ) -> Result<Response, ApiError> {
-    // A foreign page must not sign its visitor in as another user. Programs send no Origin and are
-    // not affected.
-    if headers.contains_key(header::ORIGIN) {
+    // A foreign page must not sign its visitor in as another user. Programs send neither header and
+    // are not affected.
+    if is_from_browser_page(&headers) {
         require_same_origin(&headers)?;
     }
     let now_ms = page.clock.now_ms();

@@ -568,7 +568,7 @@ fn parse_credentials(value: &str) -> Option<PresentedToken> {
 const SEC_FETCH_SITE: HeaderName = HeaderName::from_static("sec-fetch-site");
 
 /// True if a browser sent this request for a page.
-fn is_from_browser_page(headers: &HeaderMap) -> bool {
+pub(super) fn is_from_browser_page(headers: &HeaderMap) -> bool {
     headers.contains_key(SEC_FETCH_SITE) || headers.contains_key(header::ORIGIN)
 }
 

@@ -13,10 +13,13 @@ use crate::store::StoreError;
 
 /// Lifetime of an idempotency key.
 const KEY_LIFETIME_MS: u64 = 30 * DAY_MS;
+/// Time for which a network stays familiar after a sign-in from there.
+const FAMILIAR_LIFETIME_MS: u64 = 90 * DAY_MS;
 
 impl Actions {
     /// Ends assignments past their time limit, and removes old idempotency keys, tokens and page
-    /// sessions that have ended, old wrong passwords and robots that were never approved. To be
+    /// sessions that have ended, old wrong passwords, networks of old sign-ins and robots that were
+    /// never approved. To be
     /// called about once a minute. Returns the users of those tokens.
     pub async fn expire(&self) -> Result<BTreeSet<UserName>, StoreError> {
         let DeploymentActions { store, clock, changes, planner, .. } = &self.deployments;
@@ -26,6 +29,8 @@ impl Actions {
         let users = write.tokens().forget_ended(now_ms).await?;
         write.page_sessions().delete_ended(now_ms).await?;
         write.sign_in_failures().delete_ended(now_ms).await?;
+        let unused_ms = now_ms.saturating_sub(FAMILIAR_LIFETIME_MS);
+        write.familiar_networks().delete_before(unused_ms).await?;
         let given_up = expire_pending(&mut write, now_ms).await?;
         let overdue = write.assignments().overdue(now_ms).await?;
         let notifications = revert(&mut write, planner, &overdue, Phase::Expired, now_ms).await?;

@@ -14,6 +14,10 @@ use super::selection::SelectedRobot;
 use crate::domain::person::Person;
 use crate::store::{IdempotencyRecord, StoreError, Transaction};
 
+/// The most that the orders of one person take in the database. Each further order takes the place
+/// of the oldest ones.
+pub const MAX_BYTES_OF_PERSON: u64 = 16 * 1024 * 1024;
+
 /// Makes an order safe to repeat: 1 to 128 visible ASCII characters.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct IdempotencyKey(String);
@@ -90,7 +94,7 @@ pub(super) async fn store_answer<T: StoredAnswer>(
     let Some(key) = key.into() else { return Ok(()) };
     let answer = serde_json::to_string(answer).expect("an answer always has a JSON form");
     let order = IdempotencyRecord { request: request_digest(by, request), answer };
-    write.idempotency().insert(&key.0, &order, now_ms).await
+    write.idempotency().insert(&key.0, &order, &by.name, MAX_BYTES_OF_PERSON, now_ms).await
 }
 
 /// The request text stored with its answer. Requests of the first token are stored in the form used

@@ -26,7 +26,7 @@ use crate::system::clock::Clock;
 pub use crate::store::TaskOrder;
 pub use deployments::{DeploymentActions, DeploymentError, Rollback};
 pub use error::OrderError;
-pub use idempotency::{IdempotencyKey, InvalidIdempotencyKey};
+pub use idempotency::{IdempotencyKey, InvalidIdempotencyKey, MAX_BYTES_OF_PERSON};
 pub use nodes::NodeActions;
 pub use people::{PAGE_LIFETIME_MS, PersonActions, PersonError, ProviderUser, SignedIn};
 pub use robots::{Enrolled, RobotActions, RobotError};

@@ -37,6 +37,7 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[
     (23, "pages", include_str!("../migrations/0023_pages.sql")),
     (24, "cluster", include_str!("../migrations/0024_cluster.sql")),
     (25, "blob_store", include_str!("../migrations/0025_blob_store.sql")),
+    (26, "bounds", include_str!("../migrations/0026_bounds.sql")),
 ];
 
 /// The version of the tables after all migrations.

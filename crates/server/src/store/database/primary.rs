@@ -16,6 +16,9 @@ use crate::domain::database_url::{is_postgres, root_certificate, servers, withou
 /// Head start of a server before the next one of the list is tried in parallel, so that a lost host
 /// delays nothing by the whole time limit.
 const HEAD_START: Duration = Duration::from_millis(500);
+/// The beginning of sqlx's error where the other side closes the connection before its first byte,
+/// as balancers and poolers without a server do: the zero is that of sqlx's own buffer.
+const CLOSED_BEFORE_ANSWER: &str = "unexpected response from SSLRequest: 0x00";
 /// Selects why a Postgres server takes no writes; NULL if it does.
 const REFUSAL: &str = "SELECT CASE WHEN pg_is_in_recovery() THEN 'the server is a standby'
     WHEN current_setting('transaction_read_only') = 'on' THEN 'the server is read-only' END";
@@ -63,7 +66,7 @@ async fn connect_to(url: &str, session: &str) -> Result<AnyConnection, Error> {
             Error::Configuration(format!("sslrootcert {file} can't be read: {error}").into())
         })?;
     }
-    let mut connection = AnyConnection::connect(url).await.map_err(with_named_certificate_error)?;
+    let mut connection = AnyConnection::connect(url).await.map_err(with_cause)?;
     match prepare(&mut connection, url, session).await {
         Ok(()) => Ok(connection),
         Err(error) => {
@@ -86,8 +89,15 @@ async fn prepare(connection: &mut AnyConnection, url: &str, session: &str) -> Re
     }
 }
 
-/// Turns a refused certificate into an error of the settings: waiting does not mend it.
-fn with_named_certificate_error(error: Error) -> Error {
+/// Turns a closed connection into an error of the network, and a refused certificate into one of the
+/// settings: waiting mends only the first.
+fn with_cause(error: Error) -> Error {
+    if let Error::Protocol(text) = &error
+        && text.starts_with(CLOSED_BEFORE_ANSWER)
+    {
+        let text = "the connection was closed before an answer: by a balancer without a server?";
+        return Error::Io(io::Error::new(io::ErrorKind::UnexpectedEof, text));
+    }
     let Error::Io(failed) = &error else { return error };
     let tls = failed.get_ref().and_then(|source| source.downcast_ref::<rustls::Error>());
     let Some(rustls::Error::InvalidCertificate(found)) = tls else { return error };

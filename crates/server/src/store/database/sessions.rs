@@ -22,15 +22,17 @@ const POSTGRES_CONNECTION_WAIT: Duration = Duration::from_secs(20);
 /// time that there is no connection.
 pub(in crate::store) const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Creates the file of a new SQLite database so that only its owner can read it. SQLite gives the
-/// files beside it the same mode. A failure is reported later, by the code that opens the file.
+/// Creates the file of a new SQLite database, also behind a link, so that only its owner can read
+/// it. SQLite gives the files beside it the same mode. A failure is reported later, by the code that
+/// opens the file.
 pub(in crate::store) fn make_file(url: &str) {
     if !url.contains("mode=rwc") {
         return;
     }
     if let Ok(options) = SqliteConnectOptions::from_str(url) {
-        let _ =
-            File::options().write(true).create_new(true).mode(0o600).open(options.get_filename());
+        let mut private = File::options();
+        private.write(true).create(true).truncate(false).mode(0o600);
+        let _ = private.open(options.get_filename());
     }
 }
 

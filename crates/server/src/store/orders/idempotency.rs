@@ -1,8 +1,13 @@
 //! Idempotency keys of orders, and the answers to them.
 
+use task_proto::UserName;
+
 use crate::store::repositories::Idempotency;
-use crate::store::rows::stored;
+use crate::store::rows::{number, stored};
 use crate::store::{StoreError, Transaction};
+
+/// What a row takes besides its texts.
+const ROW_BYTES: usize = 256;
 
 /// An order that was carried out before.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -22,22 +27,40 @@ impl Idempotency<&mut Transaction> {
         Ok(row.map(|(request, answer)| IdempotencyRecord { request, answer }))
     }
 
-    /// Stores the order that came with `key`.
+    /// Stores the order of `person` that came with `key`. Of the person's earlier orders the
+    /// newest are kept, together with this one at most `max_bytes`.
     pub async fn insert(
         &mut self,
         key: &str,
         order: &IdempotencyRecord,
+        person: &UserName,
+        max_bytes: u64,
         now_ms: u64,
     ) -> Result<(), StoreError> {
+        let sum: Option<i64> =
+            sqlx::query_scalar("SELECT MAX(bytes_until) FROM orders WHERE person = $1")
+                .bind(person.as_str())
+                .fetch_one(self.0.connection())
+                .await?;
+        let size = ROW_BYTES + key.len() + order.request.len() + order.answer.len();
+        let bytes_until = sum.map_or(0, number).saturating_add(size as u64);
         sqlx::query(
-            "INSERT INTO orders (key, request, answer, created_at_ms) VALUES ($1, $2, $3, $4)",
+            "INSERT INTO orders (key, request, answer, created_at_ms, person, bytes_until)
+             VALUES ($1, $2, $3, $4, $5, $6)",
         )
         .bind(key)
         .bind(order.request.as_str())
         .bind(order.answer.as_str())
         .bind(stored(now_ms))
+        .bind(person.as_str())
+        .bind(stored(bytes_until))
         .execute(self.0.connection())
         .await?;
+        sqlx::query("DELETE FROM orders WHERE person = $1 AND bytes_until <= $2")
+            .bind(person.as_str())
+            .bind(stored(bytes_until.saturating_sub(max_bytes)))
+            .execute(self.0.connection())
+            .await?;
         Ok(())
     }
 

@@ -141,17 +141,18 @@ impl AuditAction {
 }
 
 impl AuditAction {
-    /// Whether every person may do the action repeatedly, whatever their role, and only to their
-    /// own account. Signing out and revoking a token are excluded: each ends once something that such
-    /// an act began. All other acts take a role that we trust with more than the length of the
-    /// audit log, and an order must not wait.
-    fn is_self_service(self) -> bool {
-        matches!(self, Self::SignIn | Self::TokenCreate | Self::UserPassword)
+    /// Whether everybody may cause the action repeatedly: a person on their own account, whatever
+    /// their role, or a stranger by wrong passwords. Signing out and revoking a token are excluded:
+    /// each ends once something that such an act began. All other acts take a role that we trust
+    /// with more than the length of the audit log, and an order must not wait.
+    fn is_limited(self) -> bool {
+        matches!(self, Self::SignIn | Self::SignInBlocked | Self::TokenCreate | Self::UserPassword)
     }
 }
 
-/// The rate limit of one person for such acts: a burst after a rest, and then 2,000 a day.
-pub(in crate::store) fn new_self_service_limit() -> KeyedRateLimit {
+/// The rate limit of one person for such acts, and of the server for blocks of sign-ins: a burst
+/// after a rest, and then 2,000 a day.
+pub(in crate::store) fn new_audit_limit() -> KeyedRateLimit {
     KeyedRateLimit::new(Duration::from_secs(24 * 60 * 60) / 2_000, 200)
 }
 
@@ -235,10 +236,10 @@ impl Audit<&mut Transaction> {
         if let Some(by) = &event.by {
             self.0.tokens().check_rights(by, now_ms).await?;
         }
-        if event.action.is_self_service()
+        if event.action.is_limited()
             && !event.by.as_ref().is_some_and(|by| by.may(Permission::Administer))
         {
-            let taken = self.0.self_service_limit.take(&event.actor, Instant::now());
+            let taken = self.0.audit_limit.take(&event.actor, Instant::now());
             taken.map_err(|wait| StoreError::TooManyActs {
                 user: event.actor.clone(),
                 seconds: seconds(wait),

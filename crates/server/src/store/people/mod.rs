@@ -2,6 +2,7 @@
 
 pub(super) mod audit;
 pub(super) mod auth_cache;
+pub(super) mod familiar_networks;
 pub(super) mod first_use;
 pub(super) mod page_sessions;
 pub(super) mod sign_in_failures;

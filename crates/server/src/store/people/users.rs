@@ -147,11 +147,12 @@ impl Users<&mut Transaction> {
         Ok(())
     }
 
-    /// Removes a user with all their tokens and page sessions.
+    /// Removes a user with all their tokens, page sessions and familiar networks.
     pub async fn remove(&mut self, name: &UserName) -> Result<(), StoreError> {
         for sql in [
             "DELETE FROM tokens WHERE user_name = $1",
             "DELETE FROM page_sessions WHERE user_name = $1",
+            "DELETE FROM familiar_networks WHERE user_name = $1",
             "DELETE FROM users WHERE name = $1",
         ] {
             sqlx::query(sql).bind(name.as_str()).execute(self.0.connection()).await?;

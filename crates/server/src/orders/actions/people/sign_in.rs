@@ -9,7 +9,9 @@ use task_proto::trust::token::{Token, TokenKind};
 
 use super::{MAX_TOKENS, PersonActions, PersonError, check_name_free};
 use crate::auth::passwords::{PasswordHash, Passwords};
-use crate::auth::sign_ins::{Blocked, Familiarity, NameDigest, Window};
+use crate::auth::sign_ins::{
+    Blocked, Familiarity, MAX_FAMILIAR, NameDigest, Network, NetworkDigest, Window,
+};
 use crate::config::RoleRule;
 use crate::orders::actions::{DAY_MS, lifetime_ms};
 use crate::store::{AuditAction, AuditEvent, NewToken, StoreError, Transaction, User};
@@ -40,12 +42,10 @@ pub struct ProviderUser {
 
 /// An attempt to sign in with a password.
 struct Attempt<'a> {
-    name: &'a UserName,
     digest: NameDigest,
     password: &'a str,
     /// The hash of the account's password; `None`: there is no account with a password.
     hash: Option<&'a PasswordHash>,
-    address: IpAddr,
     now_ms: u64,
 }
 
@@ -74,6 +74,8 @@ impl PersonActions {
         {
             return Err(PersonError::SignInRefused);
         }
+        let network = NetworkDigest::of(&order.user, address.into(), &self.key);
+        write.familiar_networks().put(&order.user, &network, MAX_FAMILIAR, now_ms).await?;
         let method = if origin == TokenOrigin::Page { "page" } else { "login" };
         let signed_in =
             begin_session(&mut write, &order.user, origin, method, address, lifetime_ms, now_ms)
@@ -177,23 +179,30 @@ impl PersonActions {
         }
         let user = self.store.users().get(name).await?;
         let hash = user.as_ref().and_then(|user| user.password.as_ref());
-        let now_ms = self.clock.now_ms();
-        let digest = NameDigest::of(name, &self.key);
-        let attempt = Attempt { name, digest, password, hash, address, now_ms };
-        let verified = match self.sign_ins.begin(name, address, now_ms) {
-            Ok(familiarity) => {
+        let (now_ms, network) = (self.clock.now_ms(), Network::from(address));
+        let stored = NetworkDigest::of(name, network, &self.key);
+        let familiarity = match self.store.familiar_networks().contains(name, &stored).await? {
+            true => Familiarity::Familiar,
+            false => Familiarity::Unfamiliar,
+        };
+        let attempt = Attempt { digest: NameDigest::of(name, &self.key), password, hash, now_ms };
+        let verified = match self.sign_ins.begin(name, network, familiarity, now_ms) {
+            Ok(()) => {
                 let verified = match familiarity {
-                    Familiarity::Familiar => self.verify_familiar(&attempt).await.map(Ok),
+                    Familiarity::Familiar => self.verify(&attempt).await.map(Ok),
                     Familiarity::Unfamiliar => self.verify_unfamiliar(&attempt).await,
                 };
-                // A fault of the server is no wrong password.
-                verified.inspect_err(|_| self.sign_ins.cancelled(name, address, familiarity))?
+                // Neither a right password nor a fault of the server is a failed attempt.
+                if !matches!(verified, Ok(Ok(false) | Err(_))) {
+                    self.sign_ins.uncount(name, network, familiarity);
+                }
+                verified?
             }
             Err(blocked) => Err(blocked),
         };
         match verified {
             Ok(true) => user.ok_or(PersonError::SignInRefused),
-            Ok(false) => Err(match self.sign_ins.blocked_at(address, now_ms) {
+            Ok(false) => Err(match self.sign_ins.blocked_at(network, now_ms) {
                 Some(blocked) => too_many_failures(blocked, now_ms),
                 None => PersonError::SignInRefused,
             }),
@@ -207,15 +216,10 @@ impl PersonActions {
         }
     }
 
-    /// Whether the password is right, where the account has recently signed in from the address.
-    async fn verify_familiar(&self, attempt: &Attempt<'_>) -> Result<bool, PersonError> {
-        let &Attempt { name, password, hash, address, now_ms, .. } = attempt;
+    /// Whether the password is right.
+    async fn verify(&self, attempt: &Attempt<'_>) -> Result<bool, PersonError> {
         let permit = self.passwords.permit().await?;
-        let is_right = self.passwords.verify(permit, password, hash).await?;
-        if is_right {
-            self.sign_ins.succeeded(name, address, Familiarity::Familiar, now_ms);
-        }
-        Ok(is_right)
+        Ok(self.passwords.verify(permit, attempt.password, attempt.hash).await?)
     }
 
     /// Whether the password is right, or else the block of the name.
@@ -223,7 +227,7 @@ impl PersonActions {
         &self,
         attempt: &Attempt<'_>,
     ) -> Result<Result<bool, Blocked>, PersonError> {
-        let Attempt { name, digest, password, hash, address, now_ms } = attempt;
+        let Attempt { digest, password, hash, now_ms } = attempt;
         // A refused attempt neither waits for a permit nor writes.
         let stored = self.store.sign_in_failures().get(digest).await?;
         if let Some(blocked) = stored.and_then(|window| window.name_block(*now_ms)) {
@@ -241,7 +245,6 @@ impl PersonActions {
                 write.sign_in_failures().put(digest, window.without_attempt()).await?;
             }
             write.commit().await?;
-            self.sign_ins.succeeded(name, *address, Familiarity::Unfamiliar, *now_ms);
         }
         Ok(Ok(is_right))
     }
@@ -292,8 +295,12 @@ impl PersonActions {
                 AuditAction::SignInBlocked,
                 subject,
             );
-            write.audit().record(&event.with("until_ms", until_ms), now_ms).await?;
-            write.commit().await?;
+            match write.audit().record(&event.with("until_ms", until_ms), now_ms).await {
+                Ok(()) => write.commit().await?,
+                // Strangers can cause blocks without end. The block holds all the same.
+                Err(StoreError::TooManyActs { .. }) => {}
+                Err(error) => return Err(error),
+            }
         }
         Ok(())
     }

@@ -5,7 +5,7 @@ use super::ServeError;
 use crate::blobs::{BlobSettings, Blobs, CommonStore, upload_mark};
 use crate::config::Config;
 use crate::domain::blob_store_url::BlobStoreUrl;
-use crate::store::Store;
+use crate::store::{Fault, Store, StoreError};
 use crate::system::data_directory::{DataDirectory, disk_space};
 
 /// Default disk reserve that people must leave free: this share of the disk, up to an absolute
@@ -31,8 +31,17 @@ pub(super) async fn open_blobs(
             let common = open_common_store(store, url).await?;
             Ok(Blobs::open_with(data.path(), settings, common)?)
         }
-        None if store.stored_blobs().has_any().await? => Err(ServeError::NoCommonStore),
+        None if has_common_blobs(store).await? => Err(ServeError::NoCommonStore),
         None => Ok(Blobs::open(data.path(), settings)?),
+    }
+}
+
+/// Whether the database's blobs lie in a common store. A database that is away is not asked, so that
+/// the server can wait for it.
+async fn has_common_blobs(store: &Store) -> Result<bool, StoreError> {
+    match store.stored_blobs().has_any().await {
+        Err(error) if error.fault() == Some(Fault::Unreachable) => Ok(false),
+        answer => answer,
     }
 }
 

@@ -21,6 +21,8 @@ const TAKEOVER_TIMEOUT: Duration = Duration::from_secs(30);
 pub struct Cluster {
     pub directory: TempDir,
     pub database: String,
+    /// The URL of a store of packages for servers that serve at the same time.
+    pub packages: String,
 }
 
 impl Cluster {
@@ -29,7 +31,10 @@ impl Cluster {
         let server = required("TASKD_TEST_POSTGRES");
         let name = format!("taskd_test_{:016x}", rand::random::<u64>());
         let directory = TempDir::new().expect("a directory");
-        let cluster = Self { directory, database: format!("{server}/postgres") };
+        let packages = directory.path().join("packages");
+        std::fs::create_dir(&packages).expect("a directory");
+        let packages = format!("file://{}", packages.display());
+        let cluster = Self { directory, database: format!("{server}/postgres"), packages };
         cluster.execute(&format!("CREATE DATABASE {name}")).await;
         Self { database: format!("{server}/{name}"), ..cluster }
     }

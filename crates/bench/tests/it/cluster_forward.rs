@@ -43,6 +43,7 @@ impl Cluster {
             directory: TempDir::new().expect("a directory"),
             database: format!("{server}/{name}"),
         };
+        std::fs::create_dir(cluster.path("packages")).expect("a directory");
         cluster.export_keys().await;
         cluster
     }
@@ -71,8 +72,10 @@ impl Cluster {
         std::fs::copy(token, data.join("operator.token")).expect("copied");
         let (http, mqtt) = (free_address(), free_address());
         let (url, secrets) = (format!("http://{http}"), self.path("secrets"));
+        let packages = format!("file://{}", self.path("packages").display());
         let settings = [
             ("TASKD_DATABASE", self.database.as_str()),
+            ("TASKD_BLOBS_STORE", &packages),
             ("TASKD_CLUSTER_NAME", name),
             ("TASKD_CLUSTER_URL", &url),
             ("TASKD_CLUSTER_SECRETS", secrets.to_str().expect("text")),

@@ -20,7 +20,6 @@ pub enum Content {
 }
 
 impl Content {
-    /// As [`Blob::quoted_digest`].
     pub fn quoted_digest(&self) -> &Bytes {
         match self {
             Self::Local(blob) => blob.quoted_digest(),

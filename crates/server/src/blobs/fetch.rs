@@ -37,7 +37,6 @@ pub(super) struct Fetches {
 /// A blob that is being fetched. Clones follow the same fetch.
 #[derive(Clone)]
 pub struct Arrival {
-    /// The growing file.
     blob: Blob,
     progress: watch::Receiver<Progress>,
 }
@@ -219,8 +218,6 @@ impl Arrival {
     pub fn size(&self) -> u64 {
         self.blob.size()
     }
-
-    /// As [`Blob::quoted_digest`].
     pub fn quoted_digest(&self) -> &Bytes {
         self.blob.quoted_digest()
     }

@@ -46,7 +46,6 @@ pub(super) enum ClusterMessage {
 /// The messages of one moment.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Packet {
-    /// The sender.
     pub(super) run: String,
     /// Counts the packets of the sender.
     pub(super) sequence: u64,

@@ -44,8 +44,6 @@ impl Messenger {
             self.bus.announce(messages(outbox.take())).await;
         }
     }
-
-    /// Receives for ever.
     pub(super) async fn receive(self) {
         loop {
             match self.bus.receive().await {

@@ -13,7 +13,6 @@ use crate::store::{RobotSession, SessionPosition, StoreError};
 
 /// The longest interval between two looks.
 const INTERVAL: Duration = Duration::from_secs(2);
-/// The shortest.
 const PAUSE: Duration = Duration::from_millis(100);
 
 /// What was read so far.
@@ -36,8 +35,6 @@ impl SessionReader {
     pub(super) fn new(cluster: Cluster, writer: Arc<SessionWriter>) -> Self {
         Self { cluster, writer, positions: HashMap::new() }
     }
-
-    /// Reads for ever.
     pub(super) async fn run(mut self) {
         let woken = self.cluster.signals.sessions.clone();
         loop {

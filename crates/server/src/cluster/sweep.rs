@@ -35,8 +35,6 @@ impl Sweep {
     pub(super) fn new(cluster: Cluster) -> Self {
         Self { cluster, notified: Notified::default() }
     }
-
-    /// Sweeps for ever.
     pub(super) async fn run(mut self) {
         let interval = match self.cluster.settings.bus {
             BusKind::Postgres => INTERVAL,

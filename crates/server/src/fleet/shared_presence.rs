@@ -84,7 +84,6 @@ pub struct UnwrittenSessions {
 }
 
 impl UnwrittenSessions {
-    /// Adds a robot.
     pub fn add(&self, robot: &RobotId) {
         if lock(&self.robots).insert(robot.clone()) {
             self.added.notify_one();

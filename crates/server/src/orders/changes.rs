@@ -49,7 +49,6 @@ pub struct Changes {
 enum Origin {
     /// At this server; the outbox is for the others of its cluster.
     Here(Option<Outbox>),
-    /// At another server.
     Elsewhere,
 }
 

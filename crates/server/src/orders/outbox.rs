@@ -45,7 +45,6 @@ pub struct News {
 }
 
 impl Outbox {
-    /// Changes the news.
     pub fn add(&self, change: impl FnOnce(&mut News)) {
         change(&mut self.0.news.lock().unwrap_or_else(PoisonError::into_inner));
         self.0.added.notify_one();
@@ -75,8 +74,6 @@ impl Outbox {
             self.0.added.notified().await;
         }
     }
-
-    /// Takes all news.
     pub fn take(&self) -> News {
         std::mem::take(&mut *self.0.news.lock().unwrap_or_else(PoisonError::into_inner))
     }

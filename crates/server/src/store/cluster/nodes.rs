@@ -24,7 +24,6 @@ pub struct NewNode<'a> {
 pub struct NodeLoad {
     /// Open streams of events.
     pub listeners: u64,
-    /// Running transfers.
     pub transfers: u64,
     /// Bytes of parts that wait to be sent over MQTT.
     pub backlog: u64,

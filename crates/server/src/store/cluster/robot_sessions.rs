@@ -32,8 +32,6 @@ pub struct LeftSession {
     pub epoch: u64,
     pub left_ms: u64,
 }
-
-/// A stored session.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RobotSession {
     pub robot: RobotId,

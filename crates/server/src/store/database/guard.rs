@@ -47,7 +47,6 @@ const MAX_ATTEMPTS: u32 = 16;
 /// How a server takes the database's lock.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Sharing {
-    /// For itself.
     Alone,
     /// Together with the other servers of its cluster.
     Cluster,

@@ -192,7 +192,7 @@ mod tests {
         let shown = sessions.overlay(&robot, None).expect("known");
         assert_eq!((shown.online, shown.last_seen_ms), (false, 5));
         assert!(sessions.was_present(&robot, start + MOVE_TIME), "until its server is given up");
-        assert_eq!(sessions.end_run("b-1", 20), [robot.clone()]);
+        assert_eq!(sessions.end_run("b-1", 20), std::slice::from_ref(&robot));
         assert!(!sessions.was_present(&robot, start));
     }
 }

@@ -380,7 +380,7 @@ mod tests {
         assert_eq!(data.signing_key().expect("read").to_bytes(), [7; 32]);
         assert_ne!(own_key, [7; 32]);
         std::fs::write(secrets.join(OPERATOR_TOKEN), "nonsense").expect("written");
-        let message = data.operator_token().err().expect("refused").to_string();
+        let message = data.operator_token().expect_err("refused").to_string();
         assert!(message.contains("copy the file that the other servers have"), "{message}");
     }
 

@@ -5,6 +5,7 @@
 use std::net::SocketAddr;
 
 use axum::body::{Body, to_bytes};
+use axum::extract::rejection::RawPathParamsRejection;
 use axum::extract::{ConnectInfo, RawPathParams, Request, State};
 use axum::middleware::Next;
 use axum::response::{IntoResponse as _, Response};
@@ -41,10 +42,12 @@ pub(in crate::http) struct ForwardState {
 pub(in crate::http) async fn to_robots_server(
     State(ForwardState { app, if_silent, body_bytes }): State<ForwardState>,
     ConnectInfo(client): ConnectInfo<SocketAddr>,
-    params: RawPathParams,
+    params: Result<RawPathParams, RawPathParamsRejection>,
     request: Request,
     next: Next,
 ) -> Response {
+    // The handler says that such a path leads nowhere.
+    let Ok(params) = params else { return next.run(request).await };
     let (parts, body) = request.into_parts();
     let peer = match robots_server(&app, &params, &parts).await {
         Ok(Some(peer)) => peer,

@@ -132,7 +132,10 @@ async fn robot_revoked_at_one_node_leaves_all() {
     let cluster = Cluster::new().await;
     let [a, b] = cluster.nodes(&[]).await;
     let robot = cluster.robot(&b, 1).await;
-    assert_eq!(sessions(&b).await, Some(vec![robot.name.clone()]));
+    eventually_within(SOON, "the session to begin", async || {
+        (sessions(&b).await? == [robot.name.clone()]).then_some(())
+    })
+    .await;
     a.operate(["robot", "revoke", &robot.name, "--yes"]).await;
     eventually_within(SOON, "the session to end", async || {
         (sessions(&b).await? == Vec::<String>::new()).then_some(())

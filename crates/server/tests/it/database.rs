@@ -214,7 +214,8 @@ pub async fn fill_all_tables(url: &str) {
     }
     let more = "UPDATE write_lock SET turn = 7, holder = 'rack-1', held_since_ms = 7;
          WITH RECURSIVE counted (n) AS (SELECT 2 UNION ALL SELECT n + 1 FROM counted WHERE n < 2100)
-         INSERT INTO orders SELECT 'key-' || n, 'request', 'answer', n FROM counted;";
+         INSERT INTO orders (key, request, answer, created_at_ms)
+         SELECT 'key-' || n, 'request', 'answer', n FROM counted;";
     sqlx::raw_sql(more).execute(&mut connection).await.expect("inserts");
     connection.close().await.expect("closes");
 }

@@ -37,7 +37,7 @@ async fn orders_of_one_person_are_remembered_up_to_a_size(database: TestDatabase
     };
     let (first, bobs) = (order(&alice).await, order(&bob).await);
     // An answer with many robots leaves room for about one more order.
-    let answer = "x".repeat(MAX_BYTES_OF_PERSON as usize - 700);
+    let answer = "x".repeat(MAX_BYTES_OF_PERSON as usize - 600);
     let large = IdempotencyRecord { request: String::new(), answer };
     let mut write = fleet.database.store.begin().await.expect("begins");
     let mut orders = write.idempotency();

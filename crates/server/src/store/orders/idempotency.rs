@@ -27,8 +27,8 @@ impl Idempotency<&mut Transaction> {
         Ok(row.map(|(request, answer)| IdempotencyRecord { request, answer }))
     }
 
-    /// Stores the order of `person` that came with `key`. Of the person's earlier orders the
-    /// newest are kept, together with this one at most `max_bytes`.
+    /// Stores the order of `person` that came with `key`. Of the person's orders those in the last
+    /// `max_bytes` are kept, the one at the limit whole.
     pub async fn insert(
         &mut self,
         key: &str,

@@ -98,6 +98,7 @@ impl<C: Context> Writable<C> for SecuritySubmessage {
 pub enum InterpreterSubmessage {
   InfoSource(InfoSource, BitFlags<INFOSOURCE_Flags>),
   InfoDestination(InfoDestination, BitFlags<INFODESTINATION_Flags>),
+  #[allow(dead_code)]
   InfoReply(InfoReply, BitFlags<INFOREPLY_Flags>),
   InfoTimestamp(InfoTimestamp, BitFlags<INFOTIMESTAMP_Flags>),
   // Pad(Pad), // Pad message does not need to be processed above serialization layer

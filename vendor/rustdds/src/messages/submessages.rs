@@ -10,7 +10,6 @@ pub mod nack_frag;
 pub mod secure_body;
 
 pub mod info_destination;
-pub mod info_reply;
 pub mod info_source;
 pub mod info_timestamp;
 

@@ -1045,26 +1045,6 @@ impl MessageReceiver {
         self.source_timestamp = None; // TODO: Why does InfoSource set timestamp
                                       // to None?
       }
-      InterpreterSubmessage::InfoReply(info_reply, flags) => {
-        self.unicast_reply_locator_list = info_reply.unicast_locator_list;
-        self.multicast_reply_locator_list = match (
-          flags.contains(INFOREPLY_Flags::Multicast),
-          info_reply.multicast_locator_list,
-        ) {
-          (true, Some(ll)) => ll, // expected case
-          (true, None) => {
-            warn!(
-              "InfoReply submessage flag indicates multicast_reply_locator_list, but none found."
-            );
-            vec![]
-          }
-          (false, None) => vec![], // This one is normal again
-          (false, Some(_)) => {
-            warn!("InfoReply submessage has unexpected multicast_reply_locator_list, ignoring.");
-            vec![]
-          }
-        };
-      }
       InterpreterSubmessage::InfoDestination(info_dest, _flags) => {
         if info_dest.guid_prefix == GUID::GUID_UNKNOWN.prefix {
           self.dest_guid_prefix = self.own_guid_prefix;

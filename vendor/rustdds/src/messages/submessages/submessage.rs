@@ -4,7 +4,7 @@ use enumflags2::BitFlags;
 use crate::{
   messages::submessages::{
     ack_nack::AckNack, data::Data, data_frag::DataFrag, gap::Gap, heartbeat::Heartbeat,
-    heartbeat_frag::HeartbeatFrag, info_destination::InfoDestination, info_reply::InfoReply,
+    heartbeat_frag::HeartbeatFrag, info_destination::InfoDestination,
     info_source::InfoSource, info_timestamp::InfoTimestamp, nack_frag::NackFrag,
     submessage_flag::*,
   },
@@ -98,8 +98,6 @@ impl<C: Context> Writable<C> for SecuritySubmessage {
 pub enum InterpreterSubmessage {
   InfoSource(InfoSource, BitFlags<INFOSOURCE_Flags>),
   InfoDestination(InfoDestination, BitFlags<INFODESTINATION_Flags>),
-  #[allow(dead_code)]
-  InfoReply(InfoReply, BitFlags<INFOREPLY_Flags>),
   InfoTimestamp(InfoTimestamp, BitFlags<INFOTIMESTAMP_Flags>),
   // Pad(Pad), // Pad message does not need to be processed above serialization layer
 }
@@ -110,7 +108,6 @@ impl<C: Context> Writable<C> for InterpreterSubmessage {
     match self {
       InterpreterSubmessage::InfoSource(s, _f) => writer.write_value(s),
       InterpreterSubmessage::InfoDestination(s, _f) => writer.write_value(s),
-      InterpreterSubmessage::InfoReply(s, _f) => writer.write_value(s),
       InterpreterSubmessage::InfoTimestamp(s, _f) => match s {
         InfoTimestamp { timestamp: None } => Ok(()), // serialization is empty string
         InfoTimestamp {

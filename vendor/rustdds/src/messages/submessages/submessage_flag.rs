@@ -139,15 +139,6 @@ submessageflag_impls!(INFODESTINATION_Flags);
 #[derive(Debug, PartialOrd, PartialEq, Ord, Eq, Readable, Clone, Copy)]
 #[repr(u8)]
 #[bitflags]
-pub enum INFOREPLY_Flags {
-  Endianness = 0b01,
-  Multicast = 0b10,
-}
-submessageflag_impls!(INFOREPLY_Flags);
-
-#[derive(Debug, PartialOrd, PartialEq, Ord, Eq, Readable, Clone, Copy)]
-#[repr(u8)]
-#[bitflags]
 pub enum INFOSOURCE_Flags {
   Endianness = 0b00001,
 }

@@ -218,6 +218,7 @@ impl Arrival {
     pub fn size(&self) -> u64 {
         self.blob.size()
     }
+
     pub fn quoted_digest(&self) -> &Bytes {
         self.blob.quoted_digest()
     }

@@ -21,6 +21,7 @@ const MISSING_INTERVAL: Duration = Duration::from_secs(1);
 const MOVE_TIME: Duration = Duration::from_secs(30);
 /// Time for which the row of a server that has ended is kept, so that people see it.
 const KEEP_TIME: Duration = Duration::from_secs(3600);
+
 pub(super) struct Membership {
     cluster: Cluster,
     bus: Arc<dyn Bus>,
@@ -52,6 +53,7 @@ impl Membership {
             error.log("this server could not join its cluster yet");
         }
     }
+
     pub(super) async fn run(self) {
         let mut ticks = tokio::time::interval(BEAT_INTERVAL);
         ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);

@@ -44,6 +44,7 @@ impl Messenger {
             self.bus.announce(messages(outbox.take())).await;
         }
     }
+
     pub(super) async fn receive(self) {
         loop {
             match self.bus.receive().await {

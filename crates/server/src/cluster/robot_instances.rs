@@ -9,6 +9,7 @@ use crate::orders::changes::Change;
 
 /// Pause after a failed comparison. The next message of the robot is compared again.
 const RETRY_INTERVAL: Duration = Duration::from_secs(1);
+
 pub(super) async fn compare(cluster: Cluster) {
     let Cluster { store, presence, changes, clock, .. } = &cluster;
     let Some(shared) = presence.shared() else { return std::future::pending().await };

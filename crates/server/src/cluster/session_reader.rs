@@ -35,6 +35,7 @@ impl SessionReader {
     pub(super) fn new(cluster: Cluster, writer: Arc<SessionWriter>) -> Self {
         Self { cluster, writer, positions: HashMap::new() }
     }
+
     pub(super) async fn run(mut self) {
         let woken = self.cluster.signals.sessions.clone();
         loop {

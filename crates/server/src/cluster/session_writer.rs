@@ -36,6 +36,7 @@ impl SessionWriter {
     pub(super) fn new(cluster: Cluster) -> Self {
         Self { cluster, written: Mutex::default() }
     }
+
     pub(super) async fn run(&self) {
         let Some(shared) = self.cluster.presence.shared() else {
             return std::future::pending().await;

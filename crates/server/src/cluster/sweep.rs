@@ -35,6 +35,7 @@ impl Sweep {
     pub(super) fn new(cluster: Cluster) -> Self {
         Self { cluster, notified: Notified::default() }
     }
+
     pub(super) async fn run(mut self) {
         let interval = match self.cluster.settings.bus {
             BusKind::Postgres => INTERVAL,

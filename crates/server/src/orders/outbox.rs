@@ -74,6 +74,7 @@ impl Outbox {
             self.0.added.notified().await;
         }
     }
+
     pub fn take(&self) -> News {
         std::mem::take(&mut *self.0.news.lock().unwrap_or_else(PoisonError::into_inner))
     }

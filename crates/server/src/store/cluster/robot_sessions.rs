@@ -32,6 +32,7 @@ pub struct LeftSession {
     pub epoch: u64,
     pub left_ms: u64,
 }
+
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RobotSession {
     pub robot: RobotId,

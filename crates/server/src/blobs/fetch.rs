@@ -179,6 +179,11 @@ async fn fetch(
         if length == 0 {
             break;
         }
+        // The store announced fewer bytes, and room was taken for these.
+        if offset + length as u64 > row.bytes {
+            common.store.remove_damaged(row).await?;
+            return Ok(false);
+        }
         let file = file.clone();
         hasher = on_disk(move || {
             let mut at = offset;

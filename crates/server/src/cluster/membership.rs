@@ -18,7 +18,7 @@ const BEAT_INTERVAL: Duration = Duration::from_secs(2);
 /// Interval between checks for robots that have left and not come back.
 const MISSING_INTERVAL: Duration = Duration::from_secs(1);
 /// Time for robots of a server that has ended to connect to another, before they count as away.
-const MOVE_TIME: Duration = Duration::from_secs(30);
+const CLEAR_DELAY: Duration = Duration::from_secs(30);
 /// Time for which the row of a server that has ended is kept, so that people see it.
 const KEEP_TIME: Duration = Duration::from_secs(3600);
 
@@ -158,7 +158,7 @@ impl EndedRuns {
     /// The runs whose sessions are to be ended.
     fn due(&self, now: Instant) -> Vec<String> {
         let is_due = |(at, is_cleared): &(Instant, bool)| {
-            !is_cleared && now.saturating_duration_since(*at) >= MOVE_TIME
+            !is_cleared && now.saturating_duration_since(*at) >= CLEAR_DELAY
         };
         self.runs.iter().filter(|(_, run)| is_due(run)).map(|(run, _)| run.clone()).collect()
     }

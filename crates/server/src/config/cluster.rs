@@ -79,6 +79,11 @@ impl Config {
         let host = || host_name().and_then(|name| name.parse().ok());
         let nameless = "missing: the host's name can't be used as the server's name";
         let name = draft.name.or_else(host).ok_or_else(|| invalid("cluster.name", nameless))?;
+        if self.blob_store.is_none() {
+            let reason =
+                "a cluster requires a common store of packages; set `blobs.store` to its URL";
+            return Err(invalid("cluster", reason));
+        }
         Ok(Some(ClusterSettings { name, url, secrets: draft.secrets, bus: draft.bus }))
     }
 }
@@ -89,12 +94,13 @@ mod tests {
     use super::*;
 
     const POSTGRES: (&str, &str) = ("TASKD_DATABASE", "postgres://u@h/d");
+    const BLOBS: (&str, &str) = ("TASKD_BLOBS_STORE", "file:///mnt/taskd");
 
     #[test]
     fn cluster_table_is_read_completely() {
         let file = "[cluster]\nname = \"a\"\nurl = \"https://10.0.0.11:8080/\"\n\
                     secrets = \"/etc/taskd/secrets\"\nbus = \"off\"";
-        let read = load(&[], &[POSTGRES], Some(file)).expect("loads").cluster;
+        let read = load(&[], &[POSTGRES, BLOBS], Some(file)).expect("loads").cluster;
         let expected = ClusterSettings {
             name: "a".parse().expect("a name"),
             url: "https://10.0.0.11:8080".to_owned(),
@@ -107,7 +113,7 @@ mod tests {
 
     #[test]
     fn name_of_a_server_defaults_to_its_host() {
-        let env = [POSTGRES, ("TASKD_CLUSTER_URL", "http://10.0.0.11:8080")];
+        let env = [POSTGRES, BLOBS, ("TASKD_CLUSTER_URL", "http://10.0.0.11:8080")];
         let cluster = load(&[], &env, None).expect("loads").cluster.expect("a cluster");
         assert_eq!(Some(cluster.name.to_string()), host_name());
         assert_eq!((cluster.bus, cluster.secrets), (Bus::Postgres, None));
@@ -120,6 +126,7 @@ mod tests {
             (&[][..], url, "cluster in taskd.toml: a cluster requires a Postgres"),
             (&[("TASKD_DATABASE", "sqlite:/x")], url, "cluster in taskd.toml: a cluster requires"),
             (&[POSTGRES], "[cluster]", "cluster.url in taskd.toml: missing"),
+            (&[POSTGRES], url, "cluster in taskd.toml: a cluster requires a common store"),
             (&[POSTGRES, ("TASKD_STANDBY", "true")], url, "standby in taskd.toml: a server of a"),
             (
                 &[POSTGRES, ("TASKD_BROKER", "mqtts://u:p@b")],

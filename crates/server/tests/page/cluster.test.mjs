@@ -28,7 +28,7 @@ function newDatabase() {
   return `${postgres}/${name}`;
 }
 
-async function startNode(t, name, database, first) {
+async function startNode(t, name, { database, packages }, first) {
   const data = join(directory(t), name);
   mkdirSync(data);
   for (const key of first ? ['signing.key', 'operator.token'] : []) {
@@ -40,6 +40,7 @@ async function startNode(t, name, database, first) {
     http,
     environment: {
       TASKD_DATABASE: database,
+      TASKD_BLOBS_STORE: `file://${packages}`,
       TASKD_CLUSTER_NAME: name,
       TASKD_CLUSTER_URL: `http://${http}`,
     },
@@ -47,9 +48,9 @@ async function startNode(t, name, database, first) {
 }
 
 test('server view lists the servers of the cluster', async (t) => {
-  const database = newDatabase();
-  const one = await startNode(t, 'one', database);
-  const two = await startNode(t, 'two', database, one);
+  const shared = { database: newDatabase(), packages: directory(t) };
+  const one = await startNode(t, 'one', shared);
+  const two = await startNode(t, 'two', shared, one);
   await agent(t, one, 'atlas');
   await eventually('both servers to know each other', async () => {
     const { nodes } = await two.ask('GET', '/cluster/nodes');

@@ -76,7 +76,7 @@ fn print(session: &Session, list: &NodeList) -> Result<(), CommandError> {
 
 const COLUMNS: Columns = Columns {
     name: "name",
-    narrow: &["name", "state", "sessions", "reports", "version", "last beat", "url"],
+    narrow: &["name", "state", "sessions", "reports", "version", "last heartbeat", "url"],
     wide: &["uptime", "transfers"],
 };
 
@@ -89,7 +89,7 @@ fn row(node: &NodeView) -> Vec<String> {
         figure(|node| Some(node.figures?.mqtt.robots_connected.to_string())),
         figure(|node| Some(format!("{:.1}/s", node.figures?.reports.per_s))),
         node.version.clone(),
-        figure(|node| Some(format!("{:.1} s ago", node.beat_age_ms? as f64 / 1000.0))),
+        figure(|node| Some(format!("{:.1} s ago", node.heartbeat_age_ms? as f64 / 1000.0))),
         node.url.clone().unwrap_or_else(unknown),
         figure(|node| Some(span(Duration::from_secs(node.figures?.uptime_s)))),
         figure(|node| Some(node.figures?.transfers.active.to_string())),

@@ -198,7 +198,7 @@ fn server_status_documents() {
                 version: "0.1.0".to_owned(),
                 state: NodeState::Serving,
                 answers: true,
-                beat_age_ms: None,
+                heartbeat_age_ms: None,
                 figures: Some(NodeFigures { uptime_s: 3600, ..NodeFigures::default() }),
             },
             NodeView {
@@ -207,7 +207,7 @@ fn server_status_documents() {
                 version: "0.1.0".to_owned(),
                 state: NodeState::Lost,
                 answers: false,
-                beat_age_ms: Some(12_000),
+                heartbeat_age_ms: Some(12_000),
                 figures: None,
             },
         ],

@@ -1,6 +1,6 @@
 //! The servers' common store of blobs: objects hold the bytes, rows of the database say which
 //! object holds which blob. An object's name is used once, so a write never meets a deletion. This
-//! module knows no local copy and decides nothing about what is needed.
+//! module knows no local copy and never decides which blobs are needed.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -256,7 +256,7 @@ impl CommonStore {
         bytes: u64,
     ) -> Result<StoredBlob, BlobError> {
         let object = new_object_name(digest);
-        // What is written below a missing mount is hidden by the mount.
+        // A later mount hides the files that are written while it is missing.
         if self.objects.is_directory() {
             self.check_name().await?;
         }

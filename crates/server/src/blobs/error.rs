@@ -1,4 +1,4 @@
-//! What can fail in the blob store, in sentences that a pusher may read.
+//! Errors of the blob store, in sentences that a pusher may read.
 
 use std::io;
 use std::path::{Path, PathBuf};

@@ -1,6 +1,6 @@
 //! Fetches of blobs from the common store into the cache: one for each blob, however many wait for
 //! it. Readers follow the file as it grows. The last bytes stay back until the whole hashes to the
-//! blob's digest, so nobody gets a wrong blob whole.
+//! blob's digest, so no reader gets a wrong blob whole.
 
 use std::collections::HashMap;
 use std::fs::{self, File};

@@ -29,7 +29,7 @@ pub enum MoveError {
     Different { digest: Digest },
 }
 
-/// What happened to the blobs of the directory.
+/// The outcome of a move.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Moved {
     /// Blobs written to the store.

@@ -420,7 +420,7 @@ impl Shared {
         room
     }
 
-    /// Closes the blob if nobody reads it. False if the blob is in use.
+    /// Closes the blob if it has no reader. False if the blob is in use.
     fn close_unused(&self, digest: Digest) -> bool {
         let Some(common) = &self.common else { return false };
         let mut open = self.open_blobs();

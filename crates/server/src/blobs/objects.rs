@@ -200,8 +200,8 @@ impl Objects {
         limited("write its name", self.store.put(&location, name.into())).await.map(drop)
     }
 
-    /// Removes what killed servers have left in a directory: files that became no object, last
-    /// written before `before_ms`. In S3 a rule of the bucket ends such parts.
+    /// Removes the incomplete files of killed servers from a directory, last written before
+    /// `before_ms`. In S3 a rule of the bucket ends such parts.
     pub(super) async fn remove_abandoned(&self, before_ms: u64) -> Result<(), BlobError> {
         let Some(directory) = self.directory.clone() else { return Ok(()) };
         on_disk(move || {

@@ -1,12 +1,12 @@
-//! The way by which servers tell each other of changes. A message that is lost, doubled or late
-//! costs time and nothing else.
+//! The message bus between servers. A message that is lost, doubled or late costs time and nothing
+//! else.
 
 use futures_util::FutureExt as _;
 use futures_util::future::BoxFuture;
 
 use super::message::ClusterMessage;
 
-/// What arrives from the other servers.
+/// Messages from the other servers, or a gap.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Received {
     Messages(Vec<ClusterMessage>),
@@ -20,7 +20,7 @@ pub(super) trait Bus: Send + Sync {
     /// the others notice that an earlier one was lost.
     fn announce(&self, messages: Vec<ClusterMessage>) -> BoxFuture<'_, ()>;
 
-    /// Waits for what arrives. Dropping the future loses nothing.
+    /// Waits for the next messages. Dropping the future loses none.
     fn receive(&self) -> BoxFuture<'_, Received>;
 
     /// The reason why nothing arrives; `None`: the bus works, as far as known.

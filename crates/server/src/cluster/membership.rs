@@ -1,5 +1,5 @@
-//! This server among the others: its beat, their beats, and the sessions of servers that have
-//! ended. Every server does the same; none leads.
+//! The membership of this server: its heartbeat, the others' heartbeats, and the sessions of servers
+//! that have ended. Every server does the same; none leads.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -13,8 +13,8 @@ use crate::domain::fleet_event::FleetEvent;
 use crate::orders::changes::Change;
 use crate::store::{NewNode, Node, NodeLoad, StoreError};
 
-/// Interval between two beats.
-const BEAT_INTERVAL: Duration = Duration::from_secs(2);
+/// Interval between two heartbeats.
+const HEARTBEAT_INTERVAL: Duration = Duration::from_secs(2);
 /// Interval between checks for robots that have left and not come back.
 const MISSING_INTERVAL: Duration = Duration::from_secs(1);
 /// Time for robots of a server that has ended to connect to another, before they count as away.
@@ -55,18 +55,18 @@ impl Membership {
     }
 
     pub(super) async fn run(self) {
-        let mut ticks = tokio::time::interval(BEAT_INTERVAL);
+        let mut ticks = tokio::time::interval(HEARTBEAT_INTERVAL);
         ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         let mut ended = EndedRuns::default();
         let mut losses = self.cluster.store.lost_connections();
         loop {
             ticks.tick().await;
             self.cluster.nodes.set_bus_problem(self.bus.problem());
-            let beaten = self.beat().await;
-            match beaten {
+            let stored = self.heartbeat().await;
+            match stored {
                 Ok(nodes) => self.observe(&nodes, &mut ended).await,
                 Err(error) => {
-                    error.log("this server's beat could not be stored");
+                    error.log("this server's heartbeat could not be stored");
                     continue;
                 }
             }
@@ -79,13 +79,13 @@ impl Membership {
         }
     }
 
-    /// Raises the own beat, and reads all.
-    async fn beat(&self) -> Result<Vec<Node>, StoreError> {
+    /// Raises the own heartbeat, and reads all.
+    async fn heartbeat(&self) -> Result<Vec<Node>, StoreError> {
         let Cluster { store, settings, run, load, listeners, .. } = &self.cluster;
         let (transfers, backlog) = load.here();
         let load = NodeLoad { listeners: listeners() as u64, transfers, backlog };
         let name = settings.name.as_str();
-        let is_known = store.nodes().beat(name, run, load).await?;
+        let is_known = store.nodes().heartbeat(name, run, load).await?;
         let nodes = store.nodes().list().await?;
         if !is_known {
             match nodes.iter().find(|node| node.name == name) {
@@ -101,8 +101,8 @@ impl Membership {
     async fn observe(&self, nodes: &[Node], ended: &mut EndedRuns) {
         let Cluster { presence, changes, outbox, load, signals, run, .. } = &self.cluster;
         let now = Instant::now();
-        let beats = nodes.iter().map(|node| (node.run.as_str(), node.beat));
-        let observed = self.cluster.nodes.observe(beats, now);
+        let heartbeats = nodes.iter().map(|node| (node.run.as_str(), node.heartbeat));
+        let observed = self.cluster.nodes.observe(heartbeats, now);
         for began in &observed.began {
             tracing::info!(run = began, "another server of the cluster serves");
             ended.runs.remove(began);
@@ -170,7 +170,7 @@ impl EndedRuns {
     }
 }
 
-/// Announces for ever the robots that have left this server and come to no other.
+/// Announces the robots that have left this server and come to no other, without end.
 pub(super) async fn announce_missing(cluster: Cluster) {
     let Cluster { presence, changes, clock, .. } = &cluster;
     let Some(shared) = presence.shared() else { return std::future::pending().await };

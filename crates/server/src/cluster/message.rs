@@ -6,7 +6,7 @@ use serde_json::Value;
 use task_proto::{RobotId, UserName};
 
 use crate::orders::change::Change;
-use crate::orders::outbox::News;
+use crate::orders::outbox::Updates;
 
 /// The largest packet, in bytes. Postgres takes 7,999.
 const MAX_PACKET_BYTES: usize = 7_500;
@@ -21,7 +21,7 @@ const ROBOTS_PER_MESSAGE: usize = 50;
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(super) enum ClusterMessage {
-    /// Tokens or what they permit have changed.
+    /// Tokens or their rights have changed.
     AdmissionsChanged,
     /// People or their tokens have changed, which long-lived connections depend on.
     RightsChanged,
@@ -60,10 +60,18 @@ impl Packet {
     }
 }
 
-/// The messages about news: first those that end rights, so that nothing uses these any more.
-pub(super) fn messages(news: News) -> Vec<ClusterMessage> {
-    let News { to_notify, robots_to_end, people_to_end, auth, rights, sessions, changes, missed } =
-        news;
+/// The messages of these updates. Those that end rights come first.
+pub(super) fn messages(updates: Updates) -> Vec<ClusterMessage> {
+    let Updates {
+        to_notify,
+        robots_to_end,
+        people_to_end,
+        auth,
+        rights,
+        sessions,
+        changes,
+        missed,
+    } = updates;
     let mut messages = Vec::new();
     messages.extend(auth.then_some(ClusterMessage::AdmissionsChanged));
     messages.extend(rights.then_some(ClusterMessage::RightsChanged));
@@ -147,18 +155,18 @@ mod tests {
     }
 
     #[test]
-    fn news_travel_in_numbered_packets_of_limited_size() {
+    fn updates_travel_in_numbered_packets_of_limited_size() {
         let robots: BTreeSet<RobotId> = (0..MAX_ROBOTS).map(|_| RobotId::random()).collect();
         let (ended, user) = (RobotId::random(), "eve".parse::<UserName>().expect("a name"));
-        let news = News {
+        let updates = Updates {
             to_notify: RobotsToNotify { all: false, robots: robots.clone() },
             robots_to_end: BTreeMap::from([(ended.clone(), Some(3))]),
             people_to_end: BTreeSet::from([user.clone()]),
             auth: true,
             changes: robots.iter().cloned().map(Change::Robot).collect(),
-            ..News::default()
+            ..Updates::default()
         };
-        let packets = packed(messages(news));
+        let packets = packed(messages(updates));
         let sequences: Vec<u64> = packets.iter().map(|packet| packet.sequence).collect();
         assert_eq!(sequences, (1..=packets.len() as u64).collect::<Vec<_>>());
         let received: Vec<_> = packets.into_iter().flat_map(Packet::into_messages).collect();
@@ -183,8 +191,8 @@ mod tests {
     fn many_robots_become_a_sweep_and_nothing_an_empty_packet() {
         let robots = (0..=MAX_ROBOTS).map(|_| RobotId::random()).collect();
         let to_notify = RobotsToNotify { all: false, robots };
-        let news = News { to_notify, ..News::default() };
-        assert_eq!(messages(news), [ClusterMessage::Sweep]);
+        let updates = Updates { to_notify, ..Updates::default() };
+        assert_eq!(messages(updates), [ClusterMessage::Sweep]);
         assert_eq!(packed(Vec::new()).len(), 1);
     }
 

@@ -1,5 +1,5 @@
-//! Sends this server's news to the others, and passes on theirs: into the same channels as local
-//! changes, and never back to the bus.
+//! Sends this server's updates to the others, and feeds theirs into the channels of local changes.
+//! It never sends another server's update again.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -9,14 +9,14 @@ use super::bus::{Bus, Received};
 use super::message::{ClusterMessage, messages};
 use crate::orders::changes::{Change, Changes};
 
-/// Time in which news are gathered before they are sent.
+/// Time in which updates are gathered before they are sent.
 const GATHER_TIME: Duration = Duration::from_millis(25);
 
 /// Both directions. Clones share the bus.
 #[derive(Clone)]
 pub(super) struct Messenger {
     cluster: Cluster,
-    /// Announces what happened at other servers.
+    /// Announces changes at other servers.
     elsewhere: Changes,
     bus: Arc<dyn Bus>,
 }
@@ -26,20 +26,20 @@ impl Messenger {
         Self { elsewhere: cluster.changes.from_elsewhere(), cluster, bus }
     }
 
-    /// Sends news for ever.
+    /// Sends updates without end.
     pub(super) async fn send(self) {
         let outbox = &self.cluster.outbox;
         let mut admissions = self.cluster.store.changed_admissions();
         loop {
             tokio::select! {
                 () = outbox.filled() => {}
-                _ = admissions.changed() => outbox.add(|news| news.auth = true),
+                _ = admissions.changed() => outbox.add(|updates| updates.auth = true),
             }
             tokio::time::sleep(GATHER_TIME).await;
-            // Changes of admissions that came with the news belong before them.
+            // A change of admissions that came with other updates belongs before them.
             if admissions.has_changed().unwrap_or(false) {
                 admissions.mark_unchanged();
-                outbox.add(|news| news.auth = true);
+                outbox.add(|updates| updates.auth = true);
             }
             self.bus.announce(messages(outbox.take())).await;
         }
@@ -80,7 +80,7 @@ impl Messenger {
         }
     }
 
-    /// Does what any missed message could have been about.
+    /// Handles every message that may have been missed.
     fn look_everywhere(&self) {
         let Cluster { store, signals, broker, .. } = &self.cluster;
         store.forget_admissions();

@@ -1,8 +1,8 @@
-//! Owns what the servers of one database tell each other: that they live, which robots they have,
-//! and what has changed; it never decides what a robot should run.
+//! Owns the messages between the servers of one database about heartbeats, sessions of robots and
+//! changes; it never decides which task a robot should run.
 //!
-//! What is told is a hint. Beats and sessions are rows, which every server reads; the sweep finds
-//! the robots that a lost message was about.
+//! A message is a hint. Heartbeats and sessions are rows, which every server reads. The sweep finds
+//! the robots that missed a message.
 
 mod bus;
 mod membership;
@@ -108,7 +108,7 @@ impl Cluster {
     }
 }
 
-/// Tells the other servers that this one has ended, so that they need not wait for its beat.
+/// Tells the other servers that this one has ended, so that they need not wait for its heartbeat.
 pub async fn leave(store: &Store, run: &str) {
     if let Err(error) = store.nodes().delete(run).await {
         error.log("the other servers will notice the end of this one by themselves");

@@ -18,7 +18,7 @@ use crate::store::{NotificationListener, Store};
 /// Packets that wait to be handled. If there are more, the rest is missed.
 const MAX_WAITING: usize = 1024;
 /// The longest silence on the connection that listens, which hears this server's own packets too;
-/// one is sent with each beat.
+/// one is sent with each heartbeat.
 const MAX_SILENCE: Duration = Duration::from_secs(7);
 /// Pause before the next attempt to listen.
 const RETRY_INTERVAL: Duration = Duration::from_millis(500);
@@ -113,7 +113,7 @@ impl Inlet {
     }
 }
 
-/// Listens for ever. Whatever was sent while nobody listened is a gap.
+/// Listens without end. Each new connection is a gap.
 async fn listen(store: Store, run: Arc<str>, inlet: Inlet) {
     let mut was_connected = false;
     loop {

@@ -15,7 +15,7 @@ use crate::store::{RobotSession, SessionPosition, StoreError};
 const INTERVAL: Duration = Duration::from_secs(2);
 const PAUSE: Duration = Duration::from_millis(100);
 
-/// What was read so far.
+/// Reads sessions of other servers, and remembers the last one of each.
 pub(super) struct SessionReader {
     cluster: Cluster,
     writer: Arc<SessionWriter>,

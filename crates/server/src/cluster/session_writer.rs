@@ -76,7 +76,7 @@ impl SessionWriter {
             self.written().remove(&session.robot);
         }
         if !left.is_empty() || new.iter().any(|session| session.known_epoch.is_none()) {
-            outbox.add(|news| news.sessions = true);
+            outbox.add(|updates| updates.sessions = true);
         }
         Ok(())
     }

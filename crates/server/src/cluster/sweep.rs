@@ -21,7 +21,7 @@ const RIGHTS_INTERVAL: Duration = Duration::from_secs(30);
 /// Time before a robot that is behind is notified again, unless its state is newer.
 const RENOTIFY_INTERVAL: Duration = Duration::from_secs(30);
 
-/// What was found before.
+/// The findings of earlier sweeps.
 pub(super) struct Sweep {
     cluster: Cluster,
     notified: Notified,

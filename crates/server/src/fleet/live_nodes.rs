@@ -1,14 +1,14 @@
-//! The servers of the cluster that live, as this one sees them: those whose beat moves, by this
-//! server's own clock. A server alone is its only node. This module never asks the database.
+//! The live servers of the cluster: those whose heartbeat moves, by this server's own clock. A
+//! server alone is its only node. This module never asks the database.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-/// The longest rest of a beat before its server counts as dead.
+/// The longest rest of a heartbeat before its server counts as dead.
 const MAX_REST: Duration = Duration::from_secs(10);
-/// The longest time between two looks. What exceeds it does not count as rest, because the database
-/// was away or this server was stopped.
+/// Longest time between two observations. Time beyond it does not count as rest, because the
+/// database was away or this server was stopped.
 const MAX_STEP: Duration = Duration::from_secs(4);
 
 /// The live servers. Clones share them.
@@ -27,12 +27,12 @@ struct KnownNodes {
 
 #[derive(Debug)]
 struct Pulse {
-    beat: u64,
-    /// When the beat last moved; `None`: the server is dead.
+    heartbeat: u64,
+    /// When the heartbeat last moved; `None`: the server is dead.
     moved_at: Option<Instant>,
 }
 
-/// What changed among the other servers.
+/// Changes among the other servers.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub struct NodeChanges {
     /// Runs that live now.
@@ -77,7 +77,7 @@ impl LiveNodes {
             || known.others.get(run).is_some_and(|pulse| pulse.moved_at.is_some())
     }
 
-    /// The time since the beat of another live run moved.
+    /// The time since the heartbeat of another live run moved.
     pub fn rest(&self, run: &str, now: Instant) -> Option<Duration> {
         let moved_at = self.known().others.get(run)?.moved_at?;
         Some(now.saturating_duration_since(moved_at))
@@ -88,11 +88,11 @@ impl LiveNodes {
         self.runs().len().max(1)
     }
 
-    /// Takes the runs and beats of all servers, as stored at `now`. A server is believed to live
-    /// when it is first seen, and dead at once when another run has its name.
+    /// Takes the runs and heartbeats of all servers, as stored at `now`. A new server counts as
+    /// live, and its earlier run as dead at once.
     pub fn observe<'a>(
         &self,
-        beats: impl IntoIterator<Item = (&'a str, u64)>,
+        heartbeats: impl IntoIterator<Item = (&'a str, u64)>,
         now: Instant,
     ) -> NodeChanges {
         let mut known = self.known();
@@ -100,14 +100,14 @@ impl LiveNodes {
         let before = known.observed_at.replace(now).unwrap_or(now);
         let unseen = now.saturating_duration_since(before).saturating_sub(MAX_STEP);
         let mut others = HashMap::new();
-        for (run, beat) in beats {
+        for (run, heartbeat) in heartbeats {
             if known.own_run.as_deref() == Some(run) {
                 continue;
             }
             let before = known.others.remove(run);
             let was_live = before.as_ref().is_some_and(|pulse| pulse.moved_at.is_some());
             let moved_at = match before {
-                Some(pulse) if pulse.beat == beat => {
+                Some(pulse) if pulse.heartbeat == heartbeat => {
                     let moved_at = pulse.moved_at.map(|at| at + unseen);
                     moved_at.filter(|at| now.saturating_duration_since(*at) < MAX_REST)
                 }
@@ -118,7 +118,7 @@ impl LiveNodes {
                 (true, false) => changes.ended.push(run.to_owned()),
                 _ => {}
             }
-            others.insert(run.to_owned(), Pulse { beat, moved_at });
+            others.insert(run.to_owned(), Pulse { heartbeat, moved_at });
         }
         let gone = std::mem::replace(&mut known.others, others);
         changes.ended.extend(
@@ -144,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn node_whose_beat_rests_too_long_is_dead_until_it_moves_again() {
+    fn node_whose_heartbeat_rests_too_long_is_dead_until_it_moves_again() {
         let (nodes, start) = (LiveNodes::default(), Instant::now());
         assert_eq!((nodes.count(), nodes.runs()), (1, Vec::new()), "a server alone");
         nodes.join("a-1");

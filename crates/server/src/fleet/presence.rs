@@ -1,7 +1,7 @@
 //! Presence of robots: whether a robot is connected over MQTT or polls over HTTP, its address,
 //! since when, and which robots have two instances that displace each other. Kept in memory only;
-//! in a cluster, what the other servers have shared is laid over it. This module never communicates
-//! and never reads a clock.
+//! in a cluster, the presence that other servers share is laid over it. This module never
+//! communicates and never reads a clock.
 
 use std::collections::HashMap;
 use std::net::SocketAddr;
@@ -61,7 +61,7 @@ struct PresenceRecord {
     last_wait_ms: Option<u64>,
     /// The token that admitted the last MQTT session.
     token_number: u64,
-    /// The last message or request that other servers were told of.
+    /// Time of the last message or request that was shared with the other servers.
     shared_ms: Option<u64>,
 }
 
@@ -77,7 +77,7 @@ impl Presence {
         Self { window_ms, started_ms: now_ms.into(), robots: Mutex::default(), shared: None }
     }
 
-    /// Shares what is seen with the other servers of the cluster.
+    /// Shares the presence of robots with the other servers of the cluster.
     pub fn share(self, shared: SharedPresence) -> Self {
         Self { shared: Some(shared), ..self }
     }

@@ -1,4 +1,4 @@
-//! What is known of one robot's presence, and how an agent identifies itself. Values only.
+//! The presence of one robot, and an agent's identity. This module has values only.
 
 use std::net::SocketAddr;
 

@@ -107,7 +107,7 @@ impl UnwrittenSessions {
     }
 }
 
-/// What is to be compared with the stored instances of a robot.
+/// A change for the stored instances of a robot.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Observed {
     /// This instance was seen at this time.

@@ -243,7 +243,7 @@ pub struct Route {
     body_bytes: usize,
     deadline: Option<Duration>,
     waits_for_robot: bool,
-    /// Whether the server with the robot's session answers, and what if it is silent.
+    /// Set if the server with the robot's session answers.
     forwarded: Option<IfSilent>,
     handler: MethodRouter<App>,
     describe: fn(&mut Draft),

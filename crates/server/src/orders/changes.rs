@@ -1,6 +1,6 @@
 //! Announces changes after the commit: notices for the event stream, and the robots whose desired
 //! state is new. Nothing here has to survive a crash: both sides compare again on connect. In a
-//! cluster, what happens here is also put into an outbox for the other servers.
+//! cluster, each announcement also goes into an outbox for the other servers.
 
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -35,7 +35,7 @@ pub struct PendingNotifications {
 #[derive(Debug, Clone)]
 pub struct Changes {
     notices: broadcast::Sender<Change>,
-    /// The notices of what happened at this server.
+    /// The notices of changes at this server.
     notices_here: broadcast::Sender<Change>,
     origin: Origin,
     fleet_events: broadcast::Sender<FleetEvent>,
@@ -72,12 +72,12 @@ impl Changes {
         }
     }
 
-    /// Puts what is announced also into `outbox`, for the other servers of the cluster.
+    /// Also puts each announcement into `outbox`, for the other servers of the cluster.
     pub fn with_outbox(self, outbox: Outbox) -> Self {
         Self { origin: Origin::Here(Some(outbox)), ..self }
     }
 
-    /// Announces to the same listeners what happened at another server.
+    /// A handle that announces changes at another server to the same listeners.
     pub fn from_elsewhere(&self) -> Self {
         Self { origin: Origin::Elsewhere, ..self.clone() }
     }
@@ -93,7 +93,7 @@ impl Changes {
     pub fn announce_rights(&self) {
         self.rights.send_replace(());
         if let Some(outbox) = self.outbox() {
-            outbox.add(|news| news.rights = true);
+            outbox.add(|updates| updates.rights = true);
         }
     }
 
@@ -101,8 +101,8 @@ impl Changes {
     /// `kept`.
     pub fn end_robot_elsewhere(&self, robot: &RobotId, kept: Option<u64>) {
         if let Some(outbox) = self.outbox() {
-            outbox.add(|news| {
-                news.robots_to_end.insert(robot.clone(), kept);
+            outbox.add(|updates| {
+                updates.robots_to_end.insert(robot.clone(), kept);
             });
         }
     }
@@ -110,8 +110,8 @@ impl Changes {
     /// Has the other servers of the cluster end the person's MQTT sessions.
     pub fn end_person_elsewhere(&self, user: &UserName) {
         if let Some(outbox) = self.outbox() {
-            outbox.add(|news| {
-                news.people_to_end.insert(user.clone());
+            outbox.add(|updates| {
+                updates.people_to_end.insert(user.clone());
             });
         }
     }
@@ -131,7 +131,7 @@ impl Changes {
         self.notices.subscribe()
     }
 
-    /// Every notice from now on of what happened at this server.
+    /// Every notice from now on of a change at this server.
     pub fn subscribe_here(&self) -> broadcast::Receiver<Change> {
         self.notices_here.subscribe()
     }
@@ -150,7 +150,7 @@ impl Changes {
         let _ = self.notices.send(change);
     }
 
-    /// Tells the listeners of this server; those of others learn of it by other means, or need not.
+    /// Tells the listeners of this server only.
     pub fn announce_here(&self, change: Change) {
         let _ = self.notices.send(change);
     }
@@ -181,7 +181,7 @@ impl Changes {
     pub fn notify_robots(&self, robots: impl IntoIterator<Item = RobotId>) {
         let robots: Vec<RobotId> = robots.into_iter().collect();
         if let Some(outbox) = self.outbox().filter(|_| !robots.is_empty()) {
-            outbox.add(|news| news.to_notify.robots.extend(robots.iter().cloned()));
+            outbox.add(|updates| updates.to_notify.robots.extend(robots.iter().cloned()));
         }
         self.notify_robots_here(robots);
     }
@@ -198,7 +198,7 @@ impl Changes {
     /// Queues notifications to all robots about their desired state.
     pub fn notify_all_robots(&self) {
         if let Some(outbox) = self.outbox() {
-            outbox.add(|news| news.to_notify.all = true);
+            outbox.add(|updates| updates.to_notify.all = true);
         }
         self.wake_queue.waiting.lock().unwrap_or_else(PoisonError::into_inner).all = true;
         self.wake_queue.added.notify_one();
@@ -227,7 +227,7 @@ impl Default for Changes {
 
 #[cfg(test)]
 mod tests {
-    use super::super::outbox::News;
+    use super::super::outbox::Updates;
     use super::*;
 
     #[test]
@@ -243,14 +243,14 @@ mod tests {
             changes.announce_rights();
         };
         announce(&changes.from_elsewhere());
-        assert_eq!(outbox.take(), News::default());
+        assert_eq!(outbox.take(), Updates::default());
         assert!(all.try_recv().is_ok() && here.try_recv().is_err());
         announce(&changes);
-        let expected = News {
+        let expected = Updates {
             to_notify: RobotsToNotify { all: false, robots: BTreeSet::from([robot]) },
             rights: true,
             changes: BTreeSet::from([Change::Deployment(deployment)]),
-            ..News::default()
+            ..Updates::default()
         };
         assert_eq!(outbox.take(), expected);
         assert!(all.try_recv().is_ok() && here.try_recv().is_ok());

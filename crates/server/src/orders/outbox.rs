@@ -1,5 +1,5 @@
-//! What the other servers of the cluster have to hear of: gathered as sets, so that a burst of
-//! changes is told once. A server alone has no outbox. This module sends nothing.
+//! Updates for the other servers of the cluster, gathered as sets, so that a burst of changes is
+//! sent once. A server alone has no outbox. This module sends nothing.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -10,30 +10,30 @@ use tokio::sync::Notify;
 
 use super::change::{Change, RobotsToNotify};
 
-/// Maximum changed objects that are named; of more, the others only hear that they missed some.
+/// Maximum changed objects that are named. Beyond it, the others learn that they missed some.
 const MAX_CHANGES: usize = 2_000;
 
-/// News that the other servers have not been told. Clones share one outbox.
+/// Updates that have not been sent. Clones share one outbox.
 #[derive(Debug, Clone, Default)]
 pub struct Outbox(Arc<Inner>);
 
 #[derive(Debug, Default)]
 struct Inner {
-    news: Mutex<News>,
+    updates: Mutex<Updates>,
     added: Notify,
     /// Whether a server has listeners to changed objects.
     has_listeners: AtomicBool,
 }
 
-/// News for the other servers.
+/// Updates for the other servers.
 #[derive(Debug, Default, PartialEq, Eq)]
-pub struct News {
+pub struct Updates {
     pub to_notify: RobotsToNotify,
     /// Robots whose connections have to end, all but those by the given token.
     pub robots_to_end: BTreeMap<RobotId, Option<u64>>,
     /// People whose MQTT sessions have to end.
     pub people_to_end: BTreeSet<UserName>,
-    /// Whether tokens or what they permit have changed.
+    /// Whether tokens or their rights have changed.
     pub auth: bool,
     /// Whether people or their tokens have changed, which long-lived connections depend on.
     pub rights: bool,
@@ -45,8 +45,8 @@ pub struct News {
 }
 
 impl Outbox {
-    pub fn add(&self, change: impl FnOnce(&mut News)) {
-        change(&mut self.0.news.lock().unwrap_or_else(PoisonError::into_inner));
+    pub fn add(&self, change: impl FnOnce(&mut Updates)) {
+        change(&mut self.0.updates.lock().unwrap_or_else(PoisonError::into_inner));
         self.0.added.notify_one();
     }
 
@@ -55,11 +55,11 @@ impl Outbox {
         if !self.0.has_listeners.load(Ordering::Relaxed) {
             return;
         }
-        self.add(|news| match news.changes.len() < MAX_CHANGES {
+        self.add(|updates| match updates.changes.len() < MAX_CHANGES {
             true => {
-                news.changes.insert(changed.clone());
+                updates.changes.insert(changed.clone());
             }
-            false => news.missed = true,
+            false => updates.missed = true,
         });
     }
 
@@ -68,15 +68,15 @@ impl Outbox {
         self.0.has_listeners.store(has_listeners, Ordering::Relaxed);
     }
 
-    /// Waits until there are news. Dropping the future loses none.
+    /// Waits until there is an update. Dropping the future loses none.
     pub async fn filled(&self) {
-        while *self.0.news.lock().unwrap_or_else(PoisonError::into_inner) == News::default() {
+        while *self.0.updates.lock().unwrap_or_else(PoisonError::into_inner) == Updates::default() {
             self.0.added.notified().await;
         }
     }
 
-    pub fn take(&self) -> News {
-        std::mem::take(&mut *self.0.news.lock().unwrap_or_else(PoisonError::into_inner))
+    pub fn take(&self) -> Updates {
+        std::mem::take(&mut *self.0.updates.lock().unwrap_or_else(PoisonError::into_inner))
     }
 }
 
@@ -89,12 +89,12 @@ mod tests {
         let outbox = Outbox::default();
         let change = |n: usize| Change::Package(format!("task{n}").parse().expect("a name"));
         outbox.add_change(&change(0));
-        assert_eq!(outbox.take(), News::default(), "nobody listens");
+        assert_eq!(outbox.take(), Updates::default(), "nobody listens");
         outbox.set_listeners(true);
         (0..MAX_CHANGES).for_each(|n| outbox.add_change(&change(n)));
         outbox.filled().await;
-        let news = outbox.take();
-        assert_eq!((news.changes.len(), news.missed), (MAX_CHANGES, false));
+        let updates = outbox.take();
+        assert_eq!((updates.changes.len(), updates.missed), (MAX_CHANGES, false));
         (0..=MAX_CHANGES).for_each(|n| outbox.add_change(&change(n)));
         assert!(outbox.take().missed);
     }

@@ -26,7 +26,7 @@ pub(super) fn new_presence(config: &Config, now_ms: u64) -> (LiveNodes, Arc<Pres
     (nodes, Arc::new(presence))
 }
 
-/// Where changes are announced, and in a cluster what is sent to the other servers.
+/// The channels of changes, and the outbox for the other servers of a cluster.
 pub(super) fn new_changes(config: &Config) -> (Changes, Outbox) {
     let (changes, outbox) = (Changes::new(), Outbox::default());
     match config.cluster {

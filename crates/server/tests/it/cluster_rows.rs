@@ -11,7 +11,7 @@ use crate::database::{TestDatabase, on_both_databases};
 use crate::fleet::Fleet;
 
 on_both_databases! {
-    beat_grows_while_the_name_belongs_to_the_run,
+    heartbeat_grows_while_the_name_belongs_to_the_run,
     session_at_another_server_replaces_the_older,
     polling_replaces_no_connection_at_a_live_server,
     ended_run_leaves_the_robots_that_moved,
@@ -68,17 +68,20 @@ async fn changed(store: &Store, run: &str, change: u64) -> Vec<RobotSession> {
     sessions
 }
 
-async fn beat_grows_while_the_name_belongs_to_the_run(database: TestDatabase) {
+async fn heartbeat_grows_while_the_name_belongs_to_the_run(database: TestDatabase) {
     let nodes = database.store.nodes();
     nodes.join(node("a", "a-1")).await.expect("stored");
     let load = NodeLoad { listeners: 1, transfers: 2, backlog: 3 };
-    assert!(nodes.beat("a", "a-1", load).await.expect("stored"));
+    assert!(nodes.heartbeat("a", "a-1", load).await.expect("stored"));
     let known = nodes.list().await.expect("reads").remove(0);
-    assert_eq!((known.beat, known.load), (2, load));
+    assert_eq!((known.heartbeat, known.load), (2, load));
     nodes.join(node("a", "a-2")).await.expect("stored");
-    assert!(!nodes.beat("a", "a-1", load).await.expect("stored"), "a newer start has the name");
+    assert!(
+        !nodes.heartbeat("a", "a-1", load).await.expect("stored"),
+        "a newer start has the name"
+    );
     let known = nodes.list().await.expect("reads").remove(0);
-    assert_eq!((known.run.as_str(), known.beat), ("a-2", 3));
+    assert_eq!((known.run.as_str(), known.heartbeat), ("a-2", 3));
     nodes.delete("a-1").await.expect("stored");
     assert_eq!(nodes.list().await.expect("reads").len(), 1);
     nodes.delete("a-2").await.expect("stored");

@@ -317,9 +317,9 @@ const servers = ({ nodes: list }) => html`
     <div class="scroll" tabindex="0" role="group" aria-labelledby="servers"><table>
       <thead><tr><th>Server</th><th>State</th><th class="number">Sessions</th>
         <th class="number">Reports</th><th class="number">Transfers</th><th>Version</th>
-        <th class="number">Last beat</th></tr></thead>
+        <th class="number">Last heartbeat</th></tr></thead>
       <tbody>${list.map(
-        ({ name, url, version, state, answers, beat_age_ms: age, figures: own }) => html`
+        ({ name, url, version, state, answers, heartbeat_age_ms: age, figures: own }) => html`
         <tr data-node=${name}>
           <td>${name}${answers ? html` <span class="quiet">this page</span>` : nothing}<br>
             <span class="code quiet">${url ?? '–'}</span></td>

@@ -189,7 +189,7 @@ pub struct NodeView {
     /// Time since it last gave a sign of life in the database, as the answering server saw it;
     /// absent for the answering server.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub beat_age_ms: Option<u64>,
+    pub heartbeat_age_ms: Option<u64>,
     /// Its figures; absent if it did not answer in time.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub figures: Option<NodeFigures>,

@@ -21,10 +21,10 @@ use crate::http::auth::Caller;
 use crate::http::error::ApiError;
 use crate::http::peers::{Patience, Peer};
 
-/// What to do if the robot's server is silent.
+/// The answer if the robot's server is silent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::http) enum IfSilent {
-    /// Answer with what this server knows.
+    /// Answer with this server's own knowledge.
     AnswerHere,
     /// Refuse the request: this server could only wait for the robot.
     Refuse,
@@ -46,7 +46,7 @@ pub(in crate::http) async fn to_robots_server(
     request: Request,
     next: Next,
 ) -> Response {
-    // The handler says that such a path leads nowhere.
+    // The handler answers that there is no such path.
     let Ok(params) = params else { return next.run(request).await };
     let (parts, body) = request.into_parts();
     let peer = match robots_server(&app, &params, &parts).await {

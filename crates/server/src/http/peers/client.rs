@@ -99,7 +99,7 @@ impl PeerClient {
         Ok(Self { http, key: PeerKey::of(key) })
     }
 
-    /// What a request proves that has reached the server `own`.
+    /// The proof of a request that has reached the server `own`.
     pub(super) fn proven(&self, own: &NodeName, request: &Request) -> Proven {
         self.key.proven(own, request.method(), request.uri(), request.headers())
     }

@@ -1,6 +1,6 @@
 //! The other servers of the cluster as this one uses them: which of them has a robot's session or
 //! an upload, their answers, and the newest figures of robots that are connected there. A server
-//! alone has none. This module never decides who may ask what: both servers guard a request.
+//! alone has none. This module never decides about a caller's rights: both servers guard a request.
 
 mod client;
 mod proof;
@@ -91,8 +91,8 @@ pub struct SessionFigures {
 /// A server of the cluster, and its figures if it answered.
 pub struct PeerStatus {
     pub node: Node,
-    /// Time since its beat moved; `None`: it is lost, or is this server.
-    pub beat_age: Option<Duration>,
+    /// Time since its heartbeat moved; `None`: it is lost, or is this server.
+    pub heartbeat_age: Option<Duration>,
     pub is_own: bool,
     pub is_live: bool,
     pub figures: Option<NodeFigures>,
@@ -118,7 +118,7 @@ impl Peers {
         self.0.as_ref().map(|cluster| &cluster.name)
     }
 
-    /// What a request proves about its sender.
+    /// The proof of a request about its sender.
     pub fn proven(&self, request: &Request) -> Proven {
         let cluster = self.0.as_ref();
         cluster.map_or(Proven::Nothing, |cluster| cluster.client.proven(&cluster.name, request))
@@ -191,8 +191,8 @@ impl Peers {
                 Some(peer) if is_live => cluster.client.ask(&peer, STATUS_PATH, &()).await,
                 _ => None,
             };
-            let beat_age = cluster.nodes.rest(&node.run, now);
-            PeerStatus { node, beat_age, is_own, is_live, figures }
+            let heartbeat_age = cluster.nodes.rest(&node.run, now);
+            PeerStatus { node, heartbeat_age, is_own, is_live, figures }
         };
         let nodes = cluster.store.nodes().list().await?;
         Ok(join_all(nodes.into_iter().map(status)).await)

@@ -1,7 +1,7 @@
 //! The proofs by which the servers of a cluster know each other's requests. They are made from the
 //! signing key, which all servers have and nothing else. A proof is for one request to one server,
-//! so no clocks are compared; requests that only read may be repeated by an eavesdropper, who has
-//! seen their answers. This module never decides what a proven request may do.
+//! so no clocks are compared. An eavesdropper can repeat only requests that read, and has seen
+//! their answers. This module never decides about the rights of a proven request.
 
 use std::net::IpAddr;
 
@@ -18,7 +18,7 @@ pub(super) const PEER: HeaderName = HeaderName::from_static("taskd-peer");
 /// The address of the client whose request is passed on, and its proof.
 pub(super) const CLIENT: HeaderName = HeaderName::from_static("taskd-client");
 
-/// What a request proves about its sender.
+/// The proof of a request about its sender.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Proven {
     /// Nothing: any client may have sent it.
@@ -60,7 +60,7 @@ impl PeerKey {
         format!("{address} {}", hex(&proof.into_bytes()))
     }
 
-    /// What a request proves that has reached the server `own`.
+    /// The proof of a request that has reached the server `own`.
     pub(super) fn proven(
         &self,
         own: &NodeName,

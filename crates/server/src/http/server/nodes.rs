@@ -31,14 +31,14 @@ pub(in crate::http) async fn list(
 
 /// A server for people; `None`: its name was stored by no server.
 pub(super) fn view(status: PeerStatus) -> Option<NodeView> {
-    let PeerStatus { node, beat_age, is_own, is_live, figures } = status;
+    let PeerStatus { node, heartbeat_age, is_own, is_live, figures } = status;
     Some(NodeView {
         name: node.name.parse().ok()?,
         url: node.url,
         version: node.version,
         state: state(is_live, figures.as_ref()),
         answers: is_own,
-        beat_age_ms: beat_age.map(millis),
+        heartbeat_age_ms: heartbeat_age.map(millis),
         figures,
     })
 }

@@ -1,4 +1,4 @@
-//! `taskd blobs`: what an operator does with the blobs of a stopped server.
+//! `taskd blobs`: moves the blobs of a stopped server.
 
 use std::io::{self, Write as _};
 

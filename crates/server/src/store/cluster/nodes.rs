@@ -35,7 +35,7 @@ pub struct Node {
     pub name: String,
     pub run: String,
     /// The server lives while this number grows.
-    pub beat: u64,
+    pub heartbeat: u64,
     pub url: Option<String>,
     pub version: String,
     pub load: NodeLoad,
@@ -45,9 +45,9 @@ impl Nodes<&Store> {
     /// Stores a server that begins to serve, in place of an earlier start of the same name.
     pub async fn join(self, node: NewNode<'_>) -> Result<(), StoreError> {
         sqlx::query(
-            "INSERT INTO nodes (name, run, beat, url, version, listeners, transfers, backlog)
+            "INSERT INTO nodes (name, run, heartbeat, url, version, listeners, transfers, backlog)
              VALUES ($1, $2, 1, $3, $4, 0, 0, 0)
-             ON CONFLICT (name) DO UPDATE SET run = excluded.run, beat = nodes.beat + 1,
+             ON CONFLICT (name) DO UPDATE SET run = excluded.run, heartbeat = nodes.heartbeat + 1,
                  url = excluded.url, version = excluded.version",
         )
         .bind(node.name)
@@ -59,10 +59,15 @@ impl Nodes<&Store> {
         Ok(())
     }
 
-    /// Raises the beat of a server. Returns whether the name still belongs to this run.
-    pub async fn beat(self, name: &str, run: &str, load: NodeLoad) -> Result<bool, StoreError> {
+    /// Raises the heartbeat of a server. Returns whether the name still belongs to this run.
+    pub async fn heartbeat(
+        self,
+        name: &str,
+        run: &str,
+        load: NodeLoad,
+    ) -> Result<bool, StoreError> {
         let updated = sqlx::query(
-            "UPDATE nodes SET beat = beat + 1, listeners = $3, transfers = $4, backlog = $5
+            "UPDATE nodes SET heartbeat = heartbeat + 1, listeners = $3, transfers = $4, backlog = $5
              WHERE name = $1 AND run = $2",
         )
         .bind(name)
@@ -87,7 +92,7 @@ impl Nodes<&Store> {
     /// All servers, by name.
     pub async fn list(self) -> Result<Vec<Node>, StoreError> {
         let rows = sqlx::query(
-            "SELECT name, run, beat, url, version, listeners, transfers, backlog FROM nodes
+            "SELECT name, run, heartbeat, url, version, listeners, transfers, backlog FROM nodes
              ORDER BY name",
         )
         .fetch_all(&self.0.reads)
@@ -101,7 +106,7 @@ fn node(row: &AnyRow) -> Result<Node, StoreError> {
     Ok(Node {
         name: row.try_get("name")?,
         run: row.try_get("run")?,
-        beat: count("beat")?,
+        heartbeat: count("heartbeat")?,
         url: row.try_get("url")?,
         version: row.try_get("version")?,
         load: NodeLoad {

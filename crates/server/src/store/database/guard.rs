@@ -352,7 +352,7 @@ impl Lock {
     }
 }
 
-/// What the servers of a fleet have in common.
+/// The values that all servers of a fleet share.
 struct Fleet {
     key_id: String,
     topic_prefix: String,
@@ -429,7 +429,7 @@ async fn fleet(connection: &mut AnyConnection) -> Result<Option<Fleet>, Error> {
     }
 }
 
-/// Stores what this server has in common with its fleet, unless the fleet has another key. A server
+/// Stores the values that all servers of a fleet share, unless the fleet has another key. A server
 /// alone may change the prefix.
 async fn join_fleet(
     connection: &mut AnyConnection,

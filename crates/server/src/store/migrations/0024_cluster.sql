@@ -1,9 +1,9 @@
--- Servers that share this database. run: one start of a server. beat: a number that it raises while it lives.
+-- Servers that share this database. run: one start of a server. heartbeat: a number that it raises while it lives.
 -- url: where the others reach it. listeners: streams of events. transfers, backlog: its load.
 CREATE TABLE nodes (
     name TEXT PRIMARY KEY,
     run TEXT NOT NULL,
-    beat BIGINT NOT NULL,
+    heartbeat BIGINT NOT NULL,
     url TEXT,
     version TEXT NOT NULL,
     listeners BIGINT NOT NULL,

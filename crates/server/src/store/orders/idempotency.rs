@@ -6,7 +6,7 @@ use crate::store::repositories::Idempotency;
 use crate::store::rows::{number, stored};
 use crate::store::{StoreError, Transaction};
 
-/// What a row takes besides its texts.
+/// Size of a row besides its texts.
 const ROW_BYTES: usize = 256;
 
 /// An order that was carried out before.

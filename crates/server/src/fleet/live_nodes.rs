@@ -47,11 +47,6 @@ impl LiveNodes {
         self.known().own_run = Some(run.to_owned());
     }
 
-    /// The run of this server; `None`: it is in no cluster.
-    pub fn own_run(&self) -> Option<String> {
-        self.known().own_run.clone()
-    }
-
     /// Sets why the other servers' notifications do not arrive.
     pub fn set_bus_problem(&self, problem: Option<String>) {
         self.known().bus_problem = problem;

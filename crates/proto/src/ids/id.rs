@@ -171,9 +171,7 @@ text_id!(
     /// A package's version; it is used as an OCI tag.
     Version like "1.0.0" r"^[A-Za-z0-9_][A-Za-z0-9._-]{0,127}$",
     "version", "at most 128 letters, digits, '.', '_' and '-', not starting with '.' or '-'", |t| {
-        t.len() <= 128
-            && t.bytes().next().is_some_and(|b| b.is_ascii_alphanumeric() || b == b'_')
-            && t.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-'))
+        is_tag(t, 128)
     }
 );
 text_id!(
@@ -208,18 +206,14 @@ text_id!(
     /// A name for a manifest inside its repository.
     Tag like "1.0.0" r"^[A-Za-z0-9_][A-Za-z0-9._-]{0,127}$",
     "tag", "at most 128 letters, digits, '.', '_' and '-', not starting with '.' or '-'", |t| {
-        t.len() <= 128
-            && t.bytes().next().is_some_and(|b| b.is_ascii_alphanumeric() || b == b'_')
-            && t.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-'))
+        is_tag(t, 128)
     }
 );
 text_id!(
     /// The name people give a robot.
     RobotName like "atlas-1" r"^[A-Za-z0-9_][A-Za-z0-9._-]{0,63}$",
     "robot name", "1 to 64 letters, digits, '.', '_' and '-', not starting with '.' or '-'", |t| {
-        t.len() <= 64
-            && t.bytes().next().is_some_and(|b| b.is_ascii_alphanumeric() || b == b'_')
-            && t.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-'))
+        is_tag(t, 64)
     }
 );
 text_id!(
@@ -238,9 +232,7 @@ text_id!(
     /// The name of a server in a cluster, by default its host's.
     NodeName like "rack-1" r"^[A-Za-z0-9_][A-Za-z0-9._-]{0,63}$",
     "server name", "1 to 64 letters, digits, '.', '_' and '-', not starting with '.' or '-'", |t| {
-        t.len() <= 64
-            && t.bytes().next().is_some_and(|b| b.is_ascii_alphanumeric() || b == b'_')
-            && t.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-'))
+        is_tag(t, 64)
     }
 );
 text_id!(
@@ -275,6 +267,13 @@ text_id!(
     LabelValue like "lab" r"^[A-Za-z0-9._/-]{0,63}$",
     "label value", "at most 63 letters, digits, '.', '_', '/' and '-'", is_label_text
 );
+
+/// Whether the text is an OCI tag of at most `max_bytes`.
+fn is_tag(text: &str, max_bytes: usize) -> bool {
+    text.len() <= max_bytes
+        && text.bytes().next().is_some_and(|b| b.is_ascii_alphanumeric() || b == b'_')
+        && text.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-'))
+}
 
 fn is_repository_component(text: &str) -> bool {
     let is_word = |b: u8| b.is_ascii_lowercase() || b.is_ascii_digit();

@@ -38,20 +38,24 @@ struct Parsed {
 
 /// Robots that meet one of the terms.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
-struct Terms {
+pub struct Terms {
     /// Terms that are only a name or an id: there may be as many as robots, so we look them up.
-    named: HashSet<RobotName>,
+    pub named: HashSet<RobotName>,
     /// Terms that are only a label: looked up as well.
-    labelled: HashMap<LabelKey, HashSet<LabelValue>>,
+    pub labelled: HashMap<LabelKey, HashSet<LabelValue>>,
     /// All other terms: a robot must meet all conditions of one. Each is tried on every robot, so
     /// we limit their number.
-    described: Vec<Vec<Condition>>,
+    pub described: Vec<Vec<Condition>>,
 }
 
+/// A condition of a term.
 #[derive(Debug, Clone, PartialEq, Eq)]
-enum Condition {
+pub enum Condition {
+    /// Every robot meets it.
     AnyRobot,
+    /// The robot has this label.
     Label(LabelKey, LabelValue),
+    /// The robot has this name or this id.
     NameOrId(RobotName),
 }
 
@@ -87,6 +91,16 @@ impl Selector {
 }
 
 impl Selector {
+    /// The terms that include robots. If there are none, all robots are included.
+    pub fn includes(&self) -> &Terms {
+        &self.0.includes
+    }
+
+    /// The terms that exclude robots, also included ones.
+    pub fn excludes(&self) -> &Terms {
+        &self.0.excludes
+    }
+
     /// The names and ids in the selector, including excluded ones, sorted.
     pub fn names(&self) -> BTreeSet<RobotName> {
         self.0.includes.names().chain(self.0.excludes.names()).cloned().collect()
@@ -102,7 +116,8 @@ impl Terms {
         self.named.iter().chain(described)
     }
 
-    fn is_empty(&self) -> bool {
+    /// Whether there are no terms.
+    pub fn is_empty(&self) -> bool {
         self.named.is_empty() && self.labelled.is_empty() && self.described.is_empty()
     }
 

@@ -76,6 +76,11 @@ impl Scope {
         Self(selectors.into_iter().collect())
     }
 
+    /// The robots of this scope that also match `selector`, if there is one.
+    pub fn and(&self, selector: Option<&Selector>) -> Self {
+        Self(self.0.iter().chain(selector).cloned().collect())
+    }
+
     /// Whether the scope has no limit.
     pub fn is_everything(&self) -> bool {
         self.0.is_empty()

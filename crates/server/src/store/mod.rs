@@ -36,6 +36,7 @@ pub use cluster::robot_sessions::{
 pub use database::connections::with_shared_reads;
 use database::connections::{ConnectionPool, PooledConnection, Statement};
 pub use database::copy::{CopyError, copy_database};
+use database::dialect::{Dialect, POSTGRES, SQLITE};
 pub use database::fault::Fault;
 use database::guard::{Guard, LAST_TURN, NEXT_TURN, holder};
 pub use database::guard::{Holder, LockAttempt, ServerIdentity, Sharing, lock_holder};
@@ -49,7 +50,7 @@ pub use database::state::DatabaseState;
 use database::write_locks::{POSTGRES_LOCKS, SQLITE_LOCKS, WriteLocks};
 pub use deliveries::{DeliveryRequest, RobotDecision, RobotFacts};
 pub use feed::{FeedAudience, NewFeedEntry};
-pub use fleet::matching::MatchingRobots;
+pub use fleet::matching::{MatchingRobots, SelectedRobot};
 pub use fleet::needed_packages::FetchGrant;
 pub use fleet::reports::{OpenAssignment, ReportTransaction, ReportedRobot, ReportingAgent};
 pub use fleet::robot_pages::RobotPage;
@@ -112,6 +113,7 @@ pub struct Store {
     /// The lock that a server holds while it uses a Postgres.
     guard: Option<Guard>,
     locks: &'static WriteLocks,
+    dialect: &'static Dialect,
 }
 
 impl fmt::Debug for Store {
@@ -303,6 +305,7 @@ pub struct Transaction {
     verified_person: Option<Person>,
     /// The rate limit for acts that every person may do.
     audit_limit: Arc<KeyedRateLimit>,
+    dialect: &'static Dialect,
 }
 
 impl Transaction {
@@ -413,6 +416,7 @@ impl Store {
             is_postgres: is_postgres(url),
             guard: None,
             locks: if is_postgres(url) { &POSTGRES_LOCKS } else { &SQLITE_LOCKS },
+            dialect: if is_postgres(url) { &POSTGRES } else { &SQLITE },
         }
     }
 
@@ -592,6 +596,7 @@ impl Store {
             invalidation,
             verified_person: None,
             audit_limit,
+            dialect: self.dialect,
         })
     }
 }

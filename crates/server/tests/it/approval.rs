@@ -57,7 +57,7 @@ async fn robot_waits_until_approval_rejection_or_a_week(database: TestDatabase) 
     assert_eq!(
         store
             .robots()
-            .matching(&"*".parse().expect("valid"), &Scope::everything())
+            .matching(&"*".parse().expect("valid"), &Scope::everything(), None)
             .await
             .expect("reads")
             .robots,
@@ -76,7 +76,7 @@ async fn robot_waits_until_approval_rejection_or_a_week(database: TestDatabase) 
     assert_eq!(
         store
             .robots()
-            .matching(&"*".parse().expect("valid"), &Scope::everything())
+            .matching(&"*".parse().expect("valid"), &Scope::everything(), None)
             .await
             .expect("reads")
             .robots
@@ -96,8 +96,14 @@ async fn robot_waits_until_approval_rejection_or_a_week(database: TestDatabase) 
     fleet.clock.advance_ms(1);
     fleet.actions.expire().await.expect("looks");
     assert_eq!(holder(&two.token).await, None);
-    let left: Vec<RobotId> =
-        store.robots().list().await.expect("reads").into_iter().map(|row| row.robot.id).collect();
+    let left: Vec<RobotId> = store
+        .robots()
+        .list(&Default::default())
+        .await
+        .expect("reads")
+        .into_iter()
+        .map(|row| row.robot.id)
+        .collect();
     assert_eq!(left, [one.robot_id]);
 }
 

@@ -172,6 +172,19 @@ pub async fn rename(url: &str, table: &str, name: &str) {
     sqlx::query(rename).execute(&mut connection).await.expect("renames");
 }
 
+/// Takes the tables back to the version before `0026_order_chunks.sql`. No order may be in chunks.
+pub async fn undo_order_chunks(url: &str) {
+    let mut connection = sqlx::AnyConnection::connect(url).await.expect("connects");
+    let undo =
+        "DROP TABLE robot_labels; DROP TABLE order_chunks; DROP INDEX deployments_cancelling;
+         ALTER TABLE deployments DROP COLUMN cancel_from;
+         ALTER TABLE deployments DROP COLUMN selected; ALTER TABLE deployments DROP COLUMN placed;
+         ALTER TABLE deployments DROP COLUMN restart;
+         DELETE FROM _sqlx_migrations WHERE version = 26";
+    sqlx::raw_sql(undo).execute(&mut connection).await.expect("undone");
+    connection.close().await.expect("closes");
+}
+
 /// The names of all tables except that of the migrations, sorted.
 pub async fn tables(url: &str) -> Vec<String> {
     let list = match url.starts_with("sqlite:") {

@@ -60,6 +60,7 @@ mod registry;
 mod robot_limits;
 mod rollouts;
 mod scope;
+mod selections;
 mod serve;
 mod settings;
 mod signatures;

@@ -46,7 +46,7 @@ async fn enrollment_gives_identities_by_mac(database: TestDatabase) {
     let two = fleet.try_enroll(&token, mac(2), None).await.expect("enrolls");
     assert_eq!(code(fleet.try_enroll(&token, mac(3), None).await), "unauthorized");
     assert_ne!(one.robot_id, two.robot_id);
-    let rows = fleet.database.store.robots().list().await.expect("reads");
+    let rows = fleet.database.store.robots().list(&Default::default()).await.expect("reads");
     assert_eq!(
         rows.iter().map(|row| row.robot.name.as_str()).collect::<Vec<_>>(),
         ["atlas", two.name.as_str()]

@@ -31,7 +31,7 @@ use crate::http::views::Views;
 use crate::orders::actions::RobotActions;
 use crate::orders::desired_states::DesiredStates;
 use crate::orders::report_writer::ReportWriter;
-use crate::store::{KnownRobot, RobotPage, RobotRow, Store};
+use crate::store::{RobotPage, Store};
 
 /// The query of `GET /robots`.
 #[derive(Deserialize, IntoParams)]
@@ -68,14 +68,7 @@ async fn listed(views: &Views, by: &Person, query: &ListQuery) -> Result<RobotLi
                 views.store.robots().page(&by.scope, selector, after, limit as usize).await?;
             (robots, next, Some(total))
         }
-        (None, None) => {
-            let mut rows = views.store.robots().list().await?;
-            rows.retain(|RobotRow { robot: KnownRobot { id, name, labels, .. }, .. }| {
-                by.scope.covers(id, name, labels)
-                    && selector.is_none_or(|selector| selector.matches(id, name, labels))
-            });
-            (rows, None, None)
-        }
+        (None, None) => (views.store.robots().list(&by.scope.and(selector)).await?, None, None),
         (None, Some(_)) => return Err(ApiError::invalid("after: requires limit")),
     };
     let unknown = match selector {

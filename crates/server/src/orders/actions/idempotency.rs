@@ -10,9 +10,8 @@ use serde::de::DeserializeOwned;
 use task_proto::{DeploymentId, Digest, RobotId};
 
 use super::error::OrderError;
-use super::selection::SelectedRobot;
 use crate::domain::person::Person;
-use crate::store::{IdempotencyRecord, StoreError, Transaction};
+use crate::store::{IdempotencyRecord, SelectedRobot, StoreError, Transaction};
 
 /// The most that the orders of one person take in the database. Each further order takes the place
 /// of the oldest ones.

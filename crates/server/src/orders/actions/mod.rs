@@ -23,14 +23,13 @@ use crate::orders::delivery_planner::DeliveryPlanner;
 use crate::store::Store;
 use crate::system::clock::Clock;
 
-pub use crate::store::TaskOrder;
+pub use crate::store::{SelectedRobot, TaskOrder};
 pub use deployments::{DeploymentActions, DeploymentError, Rollback};
 pub use error::OrderError;
 pub use idempotency::{IdempotencyKey, InvalidIdempotencyKey, MAX_BYTES_OF_PERSON};
 pub use nodes::NodeActions;
 pub use people::{PAGE_LIFETIME_MS, PersonActions, PersonError, ProviderUser, SignedIn};
 pub use robots::{Enrolled, RobotActions, RobotError};
-pub use selection::SelectedRobot;
 
 /// The order service: the actions of each noun, and those that concern several. Clones share their
 /// state.

@@ -1,20 +1,12 @@
 //! The robots that an order selects: all of them are known and in the person's scope, or the whole
 //! order is refused. A partial order would be a surprise.
 
-use serde::{Deserialize, Serialize};
+use task_proto::RobotName;
 use task_proto::ids::selector::Selector;
-use task_proto::{RobotId, RobotName};
 
 use super::error::OrderError;
 use crate::domain::person::Person;
-use crate::store::{KnownRobot, MatchingRobots, Store, Transaction};
-
-/// A robot that an order selected, in the form stored with the order's answer.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct SelectedRobot {
-    pub id: RobotId,
-    pub name: RobotName,
-}
+use crate::store::{KnownRobot, MatchingRobots, SelectedRobot, Store, Transaction};
 
 /// The robots that match this selector, sorted by name; an error if none match, or if one is
 /// outside the person's scope.
@@ -22,8 +14,17 @@ pub(super) async fn select(
     write: &mut Transaction,
     by: &Person,
     selector: &Selector,
+) -> Result<Vec<SelectedRobot>, OrderError> {
+    require_selected(by, write.robots().matching(selector, &by.scope, None).await?, selector)
+}
+
+/// Does as [`select`], with all that is known of the robots.
+pub(super) async fn select_known(
+    write: &mut Transaction,
+    by: &Person,
+    selector: &Selector,
 ) -> Result<Vec<KnownRobot>, OrderError> {
-    require_selected(by, write.robots().matching(selector, &by.scope).await?, selector)
+    require_selected(by, write.robots().matching_known(selector, &by.scope).await?, selector)
 }
 
 /// The robots that [`select`] would give to an order now.
@@ -32,32 +33,30 @@ pub(super) async fn preview(
     by: &Person,
     selector: &Selector,
 ) -> Result<Vec<SelectedRobot>, OrderError> {
-    let matching = store.robots().matching(selector, &by.scope).await?;
-    let robots = require_selected(by, matching, selector)?;
-    Ok(robots.into_iter().map(matched).collect())
+    require_selected(by, store.robots().matching(selector, &by.scope, None).await?, selector)
 }
 
-fn require_selected(
+/// The robots of a selector's result; an error if there are none, or if one is outside the person's
+/// scope.
+pub(super) fn require_selected<T>(
     by: &Person,
-    matching: MatchingRobots,
+    matching: MatchingRobots<T>,
     selector: &Selector,
-) -> Result<Vec<KnownRobot>, OrderError> {
-    let robots = require_known(matching)?;
+) -> Result<Vec<T>, OrderError> {
+    let outside = matching.outside();
+    let MatchingRobots { robots, unknown, .. } = matching;
+    require_known(unknown)?;
     if robots.is_empty() {
         return Err(OrderError::NoRobotsMatch(quoted(selector)));
     }
-    check_scope(by, &robots, || quoted(selector))?;
+    refuse_outside(by, outside, robots.len(), || quoted(selector))?;
     Ok(robots)
 }
 
-/// The robots that match. A name that no robot of the person's has is a mistake that would go
-/// unnoticed.
-pub(super) fn require_known(matching: MatchingRobots) -> Result<Vec<KnownRobot>, OrderError> {
-    if matching.unknown.is_empty() {
-        Ok(matching.robots)
-    } else {
-        Err(OrderError::UnknownRobots(matching.unknown))
-    }
+/// Refuses a selector with names and ids that belong to no robot of the person's: a mistake that
+/// would go unnoticed.
+pub(super) fn require_known(unknown: Vec<RobotName>) -> Result<(), OrderError> {
+    if unknown.is_empty() { Ok(()) } else { Err(OrderError::UnknownRobots(unknown)) }
 }
 
 /// Refuses a whole order if one of its robots is outside the person's scope. `selection` names the
@@ -71,11 +70,20 @@ pub(super) fn check_scope(
         .iter()
         .filter(|robot| !by.scope.covers(&robot.id, &robot.name, &robot.labels))
         .count();
+    refuse_outside(by, outside, robots.len(), selection)
+}
+
+/// Refuses a whole order if `outside` of its `selected` robots are outside the person's scope.
+fn refuse_outside(
+    by: &Person,
+    outside: usize,
+    selected: usize,
+    selection: impl FnOnce() -> String,
+) -> Result<(), OrderError> {
     if outside == 0 {
         return Ok(());
     }
-    let (selected, selection, person, scope) =
-        (robots.len(), selection(), by.name.clone(), by.scope.to_string());
+    let (selection, person, scope) = (selection(), by.name.clone(), by.scope.to_string());
     Err(OrderError::OutOfScope { outside, selected, selection, person, scope })
 }
 

@@ -1,13 +1,14 @@
 //! The tables, as a list of migrations that only grows: a shipped migration is never edited. Each
-//! is one SQL text for both databases, so it only uses TEXT and BIGINT columns. Each noun's tables
-//! have their own file.
+//! is one SQL text for both databases, so it only uses TEXT and BIGINT columns; the one way in which
+//! they read JSON is translated. Each noun's tables have their own file.
 
 use std::borrow::Cow;
 
 use sqlx::migrate::{MigrateError, Migration, MigrationType, Migrator};
-use sqlx::{AnyConnection, SqlSafeStr};
+use sqlx::{AnyConnection, AssertSqlSafe, SqlSafeStr as _};
 
-use crate::domain::database_url::without_password;
+use super::dialect::{POSTGRES, SQLITE};
+use crate::domain::database_url::{is_postgres, without_password};
 use crate::store::StoreError;
 
 /// Version, name and text of every migration.
@@ -38,6 +39,7 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[
     (24, "cluster", include_str!("../migrations/0024_cluster.sql")),
     (25, "blob_store", include_str!("../migrations/0025_blob_store.sql")),
     (26, "bounds", include_str!("../migrations/0026_bounds.sql")),
+    (27, "order_chunks", include_str!("../migrations/0027_order_chunks.sql")),
 ];
 
 /// The version of the tables after all migrations.
@@ -48,14 +50,10 @@ pub(in crate::store) async fn run(
     url: &str,
     connection: &mut AnyConnection,
 ) -> Result<(), StoreError> {
+    let dialect = if is_postgres(url) { &POSTGRES } else { &SQLITE };
     let migrations = MIGRATIONS.iter().map(|&(version, name, sql)| {
-        Migration::new(
-            version,
-            Cow::Borrowed(name),
-            MigrationType::Simple,
-            sql.into_sql_str(),
-            false,
-        )
+        let sql = AssertSqlSafe(dialect.translate(sql)).into_sql_str();
+        Migration::new(version, Cow::Borrowed(name), MigrationType::Simple, sql, false)
     });
     // The future of `run` itself is not guaranteed to be `Send`.
     let migrator = Migrator::with_migrations(migrations.collect());

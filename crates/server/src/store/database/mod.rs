@@ -3,6 +3,7 @@
 
 pub(super) mod connections;
 pub(super) mod copy;
+pub(super) mod dialect;
 pub(super) mod fault;
 pub(super) mod guard;
 pub(super) mod integrity;

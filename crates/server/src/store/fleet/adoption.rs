@@ -19,6 +19,15 @@ use crate::store::{StoreError, Transaction};
 const MAX_RUN: u64 = 1 << 53;
 
 impl Robots<&mut Transaction> {
+    /// Whether there are diverged robots. Mostly there are none.
+    pub async fn are_any_diverged(&mut self) -> Result<bool, StoreError> {
+        let sql = "SELECT id FROM robots
+             WHERE observed_generation > generation AND removed_at_ms IS NULL AND report IS NOT NULL LIMIT 1";
+        let found: Option<String> =
+            sqlx::query_scalar(sql).fetch_optional(self.0.connection()).await?;
+        Ok(found.is_some())
+    }
+
     /// Adopts those of `robots` that are diverged.
     pub async fn adopt_diverged(
         &mut self,

@@ -8,3 +8,4 @@ pub(super) mod needed_packages;
 pub(super) mod reports;
 pub(super) mod robot_pages;
 pub(super) mod robots;
+mod selector_sql;

@@ -83,8 +83,11 @@ pub(in crate::store) const KNOWN: &str =
 const KNOWN_BY_ID_OR_NAME: &str = "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL AND (id = $1 OR name = $1)";
 
 impl Robots<&Store> {
-    /// All robots, sorted by name.
-    pub async fn list(self) -> Result<Vec<RobotRow>, StoreError> {
+    /// The robots of a scope, sorted by name.
+    pub async fn list(self, scope: &Scope) -> Result<Vec<RobotRow>, StoreError> {
+        if !scope.is_everything() {
+            return self.among(&self.ids_in(scope).await?).await;
+        }
         // The tasks first: no phase stands beside a report that is older than the phase.
         let tasks = sqlx::query(TASK_ROWS).fetch_all(&self.0.reads).await?;
         let robots = sqlx::query(ROBOT_ROWS).fetch_all(&self.0.reads).await?;
@@ -124,33 +127,22 @@ impl Robots<&Store> {
         row.map(|row| known_robot(&row)).transpose()
     }
 
-    /// The robots in a scope.
-    pub async fn ids_in(self, scope: &Scope) -> Result<Vec<RobotId>, StoreError> {
-        Ok(self.known(scope).await?.into_iter().map(|robot| robot.id).collect())
-    }
-
     /// The robots of a scope, with the measured facts of their links.
     pub async fn with_links(
         self,
         scope: &Scope,
     ) -> Result<Vec<(KnownRobot, Option<LinkFacts>)>, StoreError> {
-        let sql = "SELECT id, name, mac, labels, link FROM robots WHERE removed_at_ms IS NULL";
-        let rows = sqlx::query(sql).fetch_all(&self.0.reads).await?;
+        let rows = self.in_scope("r.id, r.name, r.mac, r.labels, r.link", scope).await?;
         let read = |row: &sqlx::any::AnyRow| {
             Ok((known_robot(row)?, from_optional_json("robots.link", row.try_get("link")?)?))
         };
-        let mut robots =
-            rows.iter().map(read).collect::<Result<Vec<(KnownRobot, _)>, StoreError>>()?;
-        robots.retain(|(robot, _)| scope.covers(&robot.id, &robot.name, &robot.labels));
-        Ok(robots)
+        rows.iter().map(read).collect()
     }
 
     /// The robots of a scope.
     pub async fn known(self, scope: &Scope) -> Result<Vec<KnownRobot>, StoreError> {
-        let rows = sqlx::query(KNOWN).fetch_all(&self.0.reads).await?;
-        let mut robots = rows.iter().map(known_robot).collect::<Result<Vec<_>, _>>()?;
-        robots.retain(|robot| scope.covers(&robot.id, &robot.name, &robot.labels));
-        Ok(robots)
+        let rows = self.in_scope("r.id, r.name, r.mac, r.labels", scope).await?;
+        rows.iter().map(known_robot).collect()
     }
 
     pub async fn ids(self) -> Result<Vec<RobotId>, StoreError> {
@@ -174,13 +166,6 @@ impl Robots<&Store> {
     ) -> Result<Option<BrokerCredential>, StoreError> {
         let row = sqlx::query(CREDENTIALS).bind(robot.as_str());
         row.fetch_optional(&self.0.reads).await?.as_ref().map(broker_credential).transpose()
-    }
-
-    /// The robots that should have `task`.
-    pub async fn with_task(self, task: &TaskName) -> Result<Vec<RobotId>, StoreError> {
-        let rows: Vec<String> =
-            sqlx::query_scalar(WITH_TASK).bind(task.as_str()).fetch_all(&self.0.reads).await?;
-        rows.iter().map(|row| id("assignments.robot_id", row)).collect()
     }
 
     /// The robots that should have this version of the package.
@@ -258,26 +243,6 @@ impl Robots<&Store> {
 }
 
 impl Robots<&mut Transaction> {
-    /// The robots of a scope, including removed robots that were in it at their removal.
-    pub async fn ids_ever_in(&mut self, scope: &Scope) -> Result<Vec<RobotId>, StoreError> {
-        let rows = sqlx::query("SELECT id, name, mac, labels FROM robots")
-            .fetch_all(self.0.connection())
-            .await?;
-        let robots = rows.iter().map(known_robot).collect::<Result<Vec<_>, _>>()?;
-        let own =
-            robots.into_iter().filter(|robot| scope.covers(&robot.id, &robot.name, &robot.labels));
-        Ok(own.map(|robot| robot.id).collect())
-    }
-
-    /// The robots that should have `task`.
-    pub async fn with_task(&mut self, task: &TaskName) -> Result<Vec<RobotId>, StoreError> {
-        let rows: Vec<String> = sqlx::query_scalar(WITH_TASK)
-            .bind(task.as_str())
-            .fetch_all(self.0.connection())
-            .await?;
-        rows.iter().map(|row| id("assignments.robot_id", row)).collect()
-    }
-
     /// The robot registered by `mac`.
     pub async fn find_by_mac(
         &mut self,
@@ -323,7 +288,7 @@ impl Robots<&mut Transaction> {
             .bind(stored(now_ms))
             .execute(self.0.connection())
             .await?;
-        Ok(())
+        self.index_labels(&[robot]).await
     }
 
     /// Stores a robot's name and labels.
@@ -334,7 +299,7 @@ impl Robots<&mut Transaction> {
             .bind(json(&robot.labels))
             .execute(self.0.connection())
             .await?;
-        Ok(())
+        self.index_labels(&[robot]).await
     }
 
     /// Stores a robot's settings, if they differ from the stored ones. The settings are part of the
@@ -388,6 +353,23 @@ impl Robots<&mut Transaction> {
             }
             query.execute(self.0.connection()).await?;
         }
+        self.index_labels(robots).await
+    }
+
+    /// Makes the rows by which selectors find these robots those of their stored labels.
+    async fn index_labels(&mut self, robots: &[&KnownRobot]) -> Result<(), StoreError> {
+        let ids = json(&robots.iter().map(|robot| &robot.id).collect::<Vec<_>>());
+        let (texts, labels) = (self.0.dialect.texts(1), self.0.dialect.labels);
+        for sql in [
+            format!("DELETE FROM robot_labels WHERE robot_id IN ({texts})"),
+            format!(
+                "INSERT INTO robot_labels (robot_id, key, value)
+                 SELECT r.id, label.key, label.value FROM robots r CROSS JOIN {labels} AS label
+                 WHERE r.id IN ({texts})"
+            ),
+        ] {
+            sqlx::query(AssertSqlSafe(sql)).bind(&ids).execute(self.0.connection()).await?;
+        }
         Ok(())
     }
 
@@ -432,8 +414,6 @@ impl Robots<&mut Transaction> {
 
 const CREDENTIALS: &str = "SELECT id, broker_credential FROM robots
      WHERE removed_at_ms IS NULL AND revoked_at_ms IS NULL AND (id = $1 OR $1 = '')";
-
-const WITH_TASK: &str = "SELECT robot_id FROM assignments WHERE task = $1 AND desired = 1";
 
 const ROBOT_ROWS: &str =
     "SELECT r.id, r.name, r.mac, r.labels, r.enrolled_at_ms, r.generation, r.observed_generation,

@@ -16,7 +16,7 @@ use task_proto::size::format_bytes;
 use task_proto::{DeploymentId, RobotId, TaskName, Version};
 
 use super::idempotency::{IdempotencyKey, store_answer, stored_answer};
-use super::selection::{SelectedRobot, check_scope, preview, select};
+use super::selection::{check_scope, preview, select};
 use super::{OrderError, lifetime_ms};
 use crate::domain::person::Person;
 use crate::domain::rollout::Tally;
@@ -24,7 +24,8 @@ use crate::orders::changes::{Changes, PendingNotifications};
 use crate::orders::delivery_planner::{DeliveryPlanner, transfer_bytes};
 use crate::orders::rollout;
 use crate::store::{
-    AuditAction, AuditEvent, NewDeployment, Revocable, StillRunning, Store, StoreError, Transaction,
+    AuditAction, AuditEvent, NewDeployment, Revocable, SelectedRobot, StillRunning, Store,
+    StoreError, Transaction,
 };
 use crate::system::clock::Clock;
 

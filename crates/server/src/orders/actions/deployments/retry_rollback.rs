@@ -16,9 +16,11 @@ use crate::orders::actions::OrderError;
 use crate::orders::actions::idempotency::{
     IdempotencyKey, StoredAnswer, store_answer, stored_answer,
 };
-use crate::orders::actions::selection::{SelectedRobot, check_scope, matched, require_known};
+use crate::orders::actions::selection::{check_scope, matched, require_known};
 use crate::orders::changes::PendingNotifications;
-use crate::store::{AuditAction, AuditEvent, DeploymentRow, KnownRobot, Transaction};
+use crate::store::{
+    AuditAction, AuditEvent, DeploymentRow, KnownRobot, SelectedRobot, Transaction,
+};
 
 /// The result of a rollback, or its preview.
 #[derive(Debug, Clone, Default, PartialEq, serde::Serialize, serde::Deserialize)]
@@ -210,7 +212,7 @@ async fn failed_robots(
         found.retain(|one| one.failure.as_ref().is_some_and(|failure| failure.code == *code));
     }
     if let Some(selector) = &retry.selector {
-        require_known(write.robots().matching(selector, &by.scope).await?)?;
+        require_known(write.robots().unknown(selector, &by.scope).await?)?;
         found.retain(|one| selector.matches(&one.robot.id, &one.robot.name, &one.robot.labels));
     }
     let robots: Vec<KnownRobot> = found.into_iter().map(|one| one.robot).collect();
@@ -245,9 +247,9 @@ async fn plan_rollback(
                     .entry(package.manifest.digest)
                     .or_insert_with(|| (package, kind, Vec::new()));
                 target.2.push(robot.id.clone());
-                rollback.robots.push(matched(robot));
+                rollback.robots.push(robot);
             }
-            None => rollback.without.push(matched(robot)),
+            None => rollback.without.push(robot),
         }
     }
     Ok((rollback, targets.into_values().collect()))

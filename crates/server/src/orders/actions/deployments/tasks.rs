@@ -1,6 +1,6 @@
 //! Orders on tasks that robots have: start, restart, stop, remove.
 
-use std::collections::{BTreeSet, HashSet};
+use std::collections::BTreeSet;
 
 use task_proto::ids::selector::Selector;
 use task_proto::{RobotId, TaskName};
@@ -9,12 +9,10 @@ use super::{DeploymentActions, DeploymentError};
 use crate::domain::person::Person;
 use crate::orders::actions::OrderError;
 use crate::orders::actions::idempotency::{IdempotencyKey, store_answer, stored_answer};
-use crate::orders::actions::selection::{
-    SelectedRobot, check_scope, matched, quoted, require_known,
-};
+use crate::orders::actions::selection::require_selected;
 use crate::orders::changes::PendingNotifications;
 use crate::orders::rollout;
-use crate::store::{AuditAction, AuditEvent, KnownRobot, TaskOrder, Transaction};
+use crate::store::{AuditAction, AuditEvent, SelectedRobot, TaskOrder, Transaction};
 
 impl DeploymentActions {
     /// Orders `task` started, restarted, stopped or removed on the robots that match and have the
@@ -52,11 +50,10 @@ impl DeploymentActions {
             .with("robots", selector)
             .with("count", ids.len());
         write.audit().record(&event, now_ms).await?;
-        let answer: Vec<SelectedRobot> = robots.into_iter().map(matched).collect();
-        store_answer(&mut write, by, key, &request, &answer, now_ms).await?;
+        store_answer(&mut write, by, key, &request, &robots, now_ms).await?;
         write.commit().await?;
         self.changes.publish(notifications);
-        Ok(answer)
+        Ok(robots)
     }
 
     /// The robots that [`DeploymentActions::order_task`] would affect; an error if there are none.
@@ -66,10 +63,8 @@ impl DeploymentActions {
         task: &TaskName,
         selector: &Selector,
     ) -> Result<Vec<SelectedRobot>, DeploymentError> {
-        let mut robots = require_known(self.store.robots().matching(selector, &by.scope).await?)?;
-        retain_with_task(&mut robots, self.store.robots().with_task(task).await?, selector)?;
-        check_scope(by, &robots, || quoted(selector))?;
-        Ok(robots.into_iter().map(matched).collect())
+        let matching = self.store.robots().matching(selector, &by.scope, Some(task)).await?;
+        Ok(require_selected(by, matching, selector)?)
     }
 }
 
@@ -90,22 +85,14 @@ pub(super) async fn robots_with_task(
     task: &TaskName,
     selector: &Selector,
     now_ms: u64,
-) -> Result<Vec<KnownRobot>, OrderError> {
-    let mut robots = require_known(write.robots().matching(selector, &by.scope).await?)?;
-    let own = robots.iter().filter(|robot| by.scope.covers(&robot.id, &robot.name, &robot.labels));
-    let own: Vec<RobotId> = own.map(|robot| robot.id.clone()).collect();
-    write.robots().adopt_diverged(&own, now_ms).await?;
-    retain_with_task(&mut robots, write.robots().with_task(task).await?, selector)?;
-    check_scope(by, &robots, || quoted(selector))?;
-    Ok(robots)
-}
-
-fn retain_with_task(
-    robots: &mut Vec<KnownRobot>,
-    with_task: Vec<RobotId>,
-    selector: &Selector,
-) -> Result<(), OrderError> {
-    let with_task: HashSet<RobotId> = with_task.into_iter().collect();
-    robots.retain(|robot| with_task.contains(&robot.id));
-    if robots.is_empty() { Err(OrderError::NoRobotsMatch(quoted(selector))) } else { Ok(()) }
+) -> Result<Vec<SelectedRobot>, OrderError> {
+    if write.robots().are_any_diverged().await? {
+        let matching = write.robots().matching(selector, &by.scope, None).await?;
+        let own = matching.robots.into_iter().zip(matching.in_scope);
+        let own: Vec<RobotId> =
+            own.filter_map(|(robot, is_own)| is_own.then_some(robot.id)).collect();
+        write.robots().adopt_diverged(&own, now_ms).await?;
+    }
+    let matching = write.robots().matching(selector, &by.scope, Some(task)).await?;
+    require_selected(by, matching, selector)
 }

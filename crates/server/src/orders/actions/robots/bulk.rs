@@ -8,12 +8,10 @@ use super::{RobotActions, RobotError, check_labels, delete_records, format_label
 use crate::domain::person::Person;
 use crate::orders::actions::OrderError;
 use crate::orders::actions::idempotency::{IdempotencyKey, store_answer, stored_answer};
-use crate::orders::actions::selection::{
-    SelectedRobot, check_scope, matched, preview, quoted, select,
-};
+use crate::orders::actions::selection::{check_scope, matched, preview, quoted, select_known};
 use crate::orders::changes::Change;
 use crate::orders::rollout;
-use crate::store::{AuditAction, AuditEvent, KnownRobot};
+use crate::store::{AuditAction, AuditEvent, KnownRobot, SelectedRobot};
 
 impl RobotActions {
     /// Sets and removes labels of the matching robots. The robots have to be in the person's scope
@@ -40,7 +38,7 @@ impl RobotActions {
         if let Some(answer) = stored_answer(&mut write, by, key, &request).await? {
             return Ok(answer);
         }
-        let robots = select(&mut write, by, selector).await?;
+        let robots = select_known(&mut write, by, selector).await?;
         let relabelled = |robot: &KnownRobot| {
             let kept = robot.labels.iter().filter(|(key, _)| !remove.contains(*key));
             let labels: Labels =
@@ -91,7 +89,7 @@ impl RobotActions {
         if let Some(answer) = stored_answer(&mut write, by, key, &request).await? {
             return Ok(answer);
         }
-        let robots = select(&mut write, by, selector).await?;
+        let robots = select_known(&mut write, by, selector).await?;
         let mut notifications = delete_records(&mut write, &robots, now_ms).await?;
         let touched = notifications.deployments.clone();
         rollout::apply(&mut write, &self.planner, touched, now_ms, &mut notifications).await?;

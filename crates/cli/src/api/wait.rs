@@ -104,6 +104,7 @@ fn is_finished(view: &DeploymentView) -> bool {
     let mut assignments = view.assignments.iter().flatten();
     match view.state {
         DeploymentState::Cancelled => true,
+        _ if view.placing.is_some() => false,
         // A paused rollout stays paused until a user resumes the deployment.
         DeploymentState::Paused => {
             assignments.all(|a| !a.released || a.phase.is_settled(view.kind))
@@ -129,7 +130,9 @@ fn verdict(view: &DeploymentView) -> Verdict {
     let (waiting, open): (Vec<_>, Vec<_>) =
         open.into_iter().partition(|a| view.state == DeploymentState::Paused && !a.released);
     let (open, offline): (Vec<_>, Vec<_>) = open.into_iter().partition(|a| a.online);
-    let mut lines = vec![format!("{} of {} succeeded", succeeded.len(), assignments.len())];
+    let unplaced = view.unsettled_robots().unplaced;
+    let selected = assignments.len() as u64 + unplaced;
+    let mut lines = vec![format!("{} of {selected} succeeded", succeeded.len())];
     lines.extend(group_by_reason(&failed));
     lines.extend(open.iter().map(|a| format!("{}: timed out, still {}", a.name, reason(a))));
     if !offline.is_empty() {
@@ -137,6 +140,9 @@ fn verdict(view: &DeploymentView) -> Verdict {
             "offline, will follow on reconnect: {}",
             join_names(&offline, MAX_NAMES)
         ));
+    }
+    if unplaced > 0 {
+        lines.push(format!("the order was not placed for {unplaced} robots"));
     }
     if !waiting.is_empty() {
         lines.push(format!(
@@ -149,8 +155,8 @@ fn verdict(view: &DeploymentView) -> Verdict {
     if !failed.is_empty() && view.state != DeploymentState::Paused {
         lines.push(format!("to retry the failed robots: taskd deploy retry {}", view.id));
     }
-    let outcome = match (succeeded.len(), failed.len() + waiting.len(), open.len() + offline.len())
-    {
+    let unsettled = open.len() as u64 + offline.len() as u64 + unplaced;
+    let outcome = match (succeeded.len(), failed.len() + waiting.len(), unsettled) {
         (_, _, 1..) if view.state != DeploymentState::Cancelled => Outcome::TimedOut,
         (1.., 0, 0) => Outcome::Succeeded,
         (1.., _, _) => Outcome::SomeFailed,
@@ -184,6 +190,7 @@ fn reason(assignment: &AssignmentView) -> String {
 
 #[cfg(test)]
 mod tests {
+    use task_proto::api::Placing;
     use task_proto::messages::report::Phase;
 
     use super::*;
@@ -228,6 +235,22 @@ mod tests {
                 view.id
             )
         );
+    }
+
+    #[test]
+    fn deployment_is_not_finished_before_it_is_placed_for_all_robots() {
+        let running = || vec![assignment("a", Phase::Running, true)];
+        let placing = Some(Placing { selected: 3, placed: 1 });
+        let active = deployment(DeploymentState::Active, running());
+        let active = DeploymentView { placing, ..active };
+        assert!(!is_finished(&active));
+        assert_eq!(verdict(&active).outcome, Outcome::TimedOut);
+        let cancelled = DeploymentView { state: DeploymentState::Cancelled, ..active };
+        assert!(is_finished(&cancelled));
+        let verdict = verdict(&cancelled);
+        assert_eq!(verdict.outcome, Outcome::SomeFailed);
+        let expected = "1 of 3 succeeded\nthe order was not placed for 2 robots";
+        assert_eq!(verdict.text, expected);
     }
 
     #[test]

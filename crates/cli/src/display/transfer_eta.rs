@@ -139,6 +139,7 @@ pub(crate) mod tests {
             expires_at_ms: 0,
             counts: Vec::new(),
             supersedes: Vec::new(),
+            placing: None,
             outdated: false,
             assignments: Some(assignments),
         }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use task_proto::api::{
     AssignmentView, DeliveryDecision, DeploymentState, DeploymentView, MatchedRobot, MatchedRobots,
-    join_names,
+    Placing, join_names,
 };
 use task_proto::desired::Delivery;
 use task_proto::messages::report::Phase;
@@ -96,6 +96,9 @@ fn describe(view: &DeploymentView) -> String {
         ("created", time(view.created_at_ms)),
         ("expires", time(view.expires_at_ms)),
     ];
+    if let Some(Placing { selected, placed }) = view.placing {
+        facts.push(("placed", format!("for {placed} of {selected} robots")));
+    }
     if view.outdated {
         facts.push(("outdated", "a forced push replaced this version".to_owned()));
     }

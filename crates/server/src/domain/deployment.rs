@@ -67,16 +67,18 @@ pub fn is_failure(phase: Phase, kind: TaskKind) -> bool {
         && !matches!(phase, Phase::Superseded | Phase::Cancelled | Phase::Stopped)
 }
 
-/// The state of a deployment as a whole.
+/// The state of a deployment as a whole. While an order is still to be placed for some of its
+/// robots, it has not settled.
 pub fn state(
     kind: TaskKind,
     cancelled: bool,
     paused: bool,
+    is_placing: bool,
     counts: &[PhaseCount],
 ) -> DeploymentState {
     if cancelled {
         DeploymentState::Cancelled
-    } else if counts.iter().all(|count| count.phase.is_settled(kind)) {
+    } else if !is_placing && counts.iter().all(|count| count.phase.is_settled(kind)) {
         DeploymentState::Settled
     } else if paused {
         DeploymentState::Paused
@@ -153,10 +155,11 @@ mod tests {
         let count = |phase, count| PhaseCount { phase, count };
         let open = [count(Phase::Running, 3), count(Phase::Assigned, 1)];
         let done = [count(Phase::Running, 3), count(Phase::Failed, 1)];
-        assert_eq!(state(TaskKind::Service, false, false, &open), DeploymentState::Active);
-        assert_eq!(state(TaskKind::Service, false, true, &open), DeploymentState::Paused);
-        assert_eq!(state(TaskKind::Service, false, true, &done), DeploymentState::Settled);
-        assert_eq!(state(TaskKind::Job, false, false, &done), DeploymentState::Active);
-        assert_eq!(state(TaskKind::Service, true, false, &open), DeploymentState::Cancelled);
+        assert_eq!(state(TaskKind::Service, false, false, false, &open), DeploymentState::Active);
+        assert_eq!(state(TaskKind::Service, false, true, false, &open), DeploymentState::Paused);
+        assert_eq!(state(TaskKind::Service, false, true, false, &done), DeploymentState::Settled);
+        assert_eq!(state(TaskKind::Job, false, false, false, &done), DeploymentState::Active);
+        assert_eq!(state(TaskKind::Service, true, false, true, &done), DeploymentState::Cancelled);
+        assert_eq!(state(TaskKind::Service, false, false, true, &done), DeploymentState::Active);
     }
 }

@@ -26,6 +26,8 @@ pub struct Rollout {
     pub forgiven: u64,
     /// Whether the rollout waits for the operator.
     pub paused: bool,
+    /// Whether the order is still to be placed for some of its robots: more will wait for a batch.
+    pub is_placing: bool,
 }
 
 /// The progress of a robot with an unsettled assignment.
@@ -130,6 +132,7 @@ pub fn next_move(rollout: &Rollout, tally: &Tally) -> Move {
     match rollout.batch {
         None => Move::Release(waiting),
         Some(_) if tally.busy > 0 => Move::Wait,
+        Some(_) if tally.ready == 0 && rollout.is_placing => Move::Wait,
         Some(_) if tally.ready == 0 => Move::AwaitOffline,
         Some(batch) => Move::Release(batch.clamp(1, tally.ready)),
     }
@@ -140,6 +143,10 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+
+    /// A rollout without limits.
+    const UNLIMITED: Rollout =
+        Rollout { batch: None, max_failures: None, forgiven: 0, paused: false, is_placing: false };
 
     /// A robot of the model: its outcome, and its time offline.
     #[derive(Debug, Clone)]
@@ -188,7 +195,7 @@ mod tests {
             batch in proptest::option::of(1u64..9),
             max_failures in proptest::option::of(0u64..6),
         ) {
-            let mut rollout = Rollout { batch, max_failures, forgiven: 0, paused: false };
+            let mut rollout = Rollout { batch, max_failures, ..UNLIMITED };
             // After three hours all robots are online for good. A batch of one takes two minutes,
             // and at most ten of waiting.
             for minute in 0..(180 + 12 * robots.len() as u64) {
@@ -235,10 +242,14 @@ mod tests {
         /// the absence of one batch can cost.
         #[test]
         fn offline_robots_never_hold_back_the_others(absent in 1u64..50, online in 1u64..50, batch in 1u64..9) {
-            let rollout = Rollout { batch: Some(batch), max_failures: Some(0), forgiven: 0, paused: false };
+            let rollout = Rollout { batch: Some(batch), max_failures: Some(0), ..UNLIMITED };
             let tally = Tally { ready: online, offline: absent, ..Tally::default() };
             prop_assert_eq!(next_move(&rollout, &tally), Move::Release(batch.min(online)));
-            prop_assert_eq!(next_move(&rollout, &Tally { ready: 0, ..tally }), Move::AwaitOffline);
+            let none_ready = Tally { ready: 0, ..tally };
+            prop_assert_eq!(next_move(&rollout, &none_ready), Move::AwaitOffline);
+            // Those that the order is not placed for yet may be online.
+            let placing = Rollout { is_placing: true, ..rollout };
+            prop_assert_eq!(next_move(&placing, &none_ready), Move::Wait);
         }
     }
 
@@ -262,7 +273,7 @@ mod tests {
 
     #[test]
     fn lost_robot_counts_as_a_failure() {
-        let rollout = Rollout { batch: Some(2), max_failures: Some(0), forgiven: 0, paused: false };
+        let rollout = Rollout { batch: Some(2), max_failures: Some(0), ..UNLIMITED };
         let tally = Tally { ready: 5, lost: 1, ..Tally::default() };
         assert_eq!(next_move(&rollout, &tally), Move::Pause);
         assert_eq!(
@@ -274,7 +285,7 @@ mod tests {
 
     #[test]
     fn resumed_rollout_tolerates_max_failures_again() {
-        let rollout = Rollout { batch: Some(2), max_failures: Some(1), forgiven: 2, paused: false };
+        let rollout = Rollout { batch: Some(2), max_failures: Some(1), forgiven: 2, ..UNLIMITED };
         let tally = Tally { ready: 5, failed: 3, ..Tally::default() };
         assert_eq!(next_move(&rollout, &tally), Move::Release(2));
         assert_eq!(next_move(&rollout, &Tally { failed: 4, ..tally }), Move::Pause);

@@ -9,7 +9,7 @@ use tokio::sync::broadcast::{
     self,
     error::{RecvError, TryRecvError},
 };
-use tokio::time::{Interval, MissedTickBehavior};
+use tokio::time::{Instant, Interval, MissedTickBehavior};
 use tokio_util::sync::CancellationToken;
 
 use crate::domain::fleet_event::FleetEvent;
@@ -26,6 +26,10 @@ const SILENCE_INTERVAL: Duration = Duration::from_secs(5);
 const ROLLOUT_INTERVAL: Duration = Duration::from_secs(10);
 /// Minimum interval between checks of rollouts, however many robots come meanwhile.
 const ROLLOUT_PAUSE: Duration = Duration::from_millis(250);
+/// Interval between checks for orders that another server has left unfinished.
+const CONTINUE_INTERVAL: Duration = Duration::from_secs(10);
+/// Maximum pause between two parts of an order.
+const MAX_CONTINUE_PAUSE: Duration = Duration::from_millis(500);
 /// Interval between checks for robots whose violations have expired.
 const VIOLATION_INTERVAL: Duration = Duration::from_secs(1);
 /// Interval between measurements of the server's load.
@@ -67,6 +71,40 @@ pub(super) async fn advance_rollouts(app: App) {
         tokio::select! {
             () = app.stop.cancelled() => return,
             () = tokio::time::sleep(ROLLOUT_PAUSE) => {}
+        }
+    }
+}
+
+/// Carries out large orders part by part, also those that were left by a server which has ended.
+/// After each part, reports have the database for as long as the part had it.
+pub(super) async fn continue_orders(app: App) {
+    let deployments = &app.actions.deployments;
+    let mut ticks = ticks(CONTINUE_INTERVAL);
+    loop {
+        tokio::select! {
+            () = app.stop.cancelled() => return,
+            _ = ticks.tick() => {}
+            () = deployments.order_to_continue() => {}
+        }
+        let mut began = Instant::now();
+        loop {
+            match deployments.continue_order().await {
+                Ok(true) => {}
+                Ok(false) => break,
+                Err(error) => {
+                    let error = &error as &dyn std::error::Error;
+                    tracing::error!(
+                        error,
+                        "an order could not be carried out for its other robots"
+                    );
+                    break;
+                }
+            }
+            tokio::select! {
+                () = app.stop.cancelled() => return,
+                () = tokio::time::sleep(began.elapsed().min(MAX_CONTINUE_PAUSE)) => {}
+            }
+            began = Instant::now();
         }
     }
 }

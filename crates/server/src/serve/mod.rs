@@ -32,7 +32,8 @@ use self::blobs::open_blobs;
 use self::cluster::{new_changes, new_presence, start_cluster};
 use self::database::{Database, FirstOperator, check_periodically};
 use self::jobs::{
-    advance_rollouts, announce_silent_robots, announce_violations, expire_assignments, sample_load,
+    advance_rollouts, announce_silent_robots, announce_violations, continue_orders,
+    expire_assignments, sample_load,
 };
 use self::part_settings::{action_settings, tls_settings};
 use crate::auth::oidc::{OidcSetupError, Provider};
@@ -488,6 +489,7 @@ fn start_tasks(tasks: &TaskTracker, app: &App, config: &Config, load: Arc<Server
     tasks.spawn(feed::run(source, app.changes.clone(), app.stop.clone()));
     tasks.spawn(announce_silent_robots(app.clone()));
     tasks.spawn(advance_rollouts(app.clone()));
+    tasks.spawn(continue_orders(app.clone()));
     tasks.spawn(announce_violations(app.clone()));
 }
 

@@ -54,7 +54,7 @@ impl Deliveries<&mut Transaction> {
     ) -> Result<DeliveryRequest, StoreError> {
         let row = sqlx::query(
             "SELECT delivery, package,
-                 (SELECT COUNT(*) FROM assignments WHERE deployment_id = deployments.id) AS robots
+                 COALESCE(selected, (SELECT COUNT(*) FROM assignments WHERE deployment_id = deployments.id)) AS robots
              FROM deployments WHERE id = $1",
         )
         .bind(deployment.as_str())

@@ -56,6 +56,7 @@ pub use fleet::reports::{OpenAssignment, ReportTransaction, ReportedRobot, Repor
 pub use fleet::robot_pages::RobotPage;
 pub use fleet::robots::{BrokerCredential, DesiredTasks, KnownRobot, RobotRow};
 pub use orders::assignments::{ReleasedBatch, TaskOrder};
+pub use orders::chunks::OrderChunk;
 pub use orders::deployments::{
     AssignmentRow, DeploymentPage, DeploymentRow, NewDeployment, OpenRobot, OpenRollout,
 };

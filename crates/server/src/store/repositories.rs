@@ -44,6 +44,8 @@ repositories! {
     reports: Reports;
     /// Deployments: the orders to bring a package onto robots.
     deployments: Deployments;
+    /// The rest of large orders: selected robots that have no assignment yet.
+    order_chunks: OrderChunks;
     /// Assignments: each deployment's part for each robot.
     assignments: Assignments;
     /// Decisions on how each robot receives a package.

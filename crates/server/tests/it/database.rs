@@ -172,7 +172,7 @@ pub async fn rename(url: &str, table: &str, name: &str) {
     sqlx::query(rename).execute(&mut connection).await.expect("renames");
 }
 
-/// Takes the tables back to the version before `0026_order_chunks.sql`. No order may be in chunks.
+/// Takes the tables back to the version before `0027_order_chunks.sql`. No order may be in chunks.
 pub async fn undo_order_chunks(url: &str) {
     let mut connection = sqlx::AnyConnection::connect(url).await.expect("connects");
     let undo =
@@ -180,7 +180,7 @@ pub async fn undo_order_chunks(url: &str) {
          ALTER TABLE deployments DROP COLUMN cancel_from;
          ALTER TABLE deployments DROP COLUMN selected; ALTER TABLE deployments DROP COLUMN placed;
          ALTER TABLE deployments DROP COLUMN restart;
-         DELETE FROM _sqlx_migrations WHERE version = 26";
+         DELETE FROM _sqlx_migrations WHERE version = 27";
     sqlx::raw_sql(undo).execute(&mut connection).await.expect("undone");
     connection.close().await.expect("closes");
 }

@@ -110,7 +110,20 @@ impl Fleet {
         Self::with_delivery(database, &DeliverySettings::default()).await
     }
 
+    /// A fleet whose orders are placed for at most `robots` robots in one write.
+    pub async fn with_chunks(database: TestDatabase, robots: usize) -> Self {
+        Self::with_settings(database, &DeliverySettings::default(), robots).await
+    }
+
     pub async fn with_delivery(database: TestDatabase, settings: &DeliverySettings) -> Self {
+        Self::with_settings(database, settings, ActionSettings::default().chunk_robots).await
+    }
+
+    async fn with_settings(
+        database: TestDatabase,
+        settings: &DeliverySettings,
+        chunk_robots: usize,
+    ) -> Self {
         let load = Arc::new(ServerLoad::default());
         let (clock, changes) = (Clock::fixed(1_000_000), Changes::new());
         let presence = Arc::new(Presence::new(90_000, clock.now_ms()));
@@ -133,7 +146,11 @@ impl Fleet {
                 clock.clone(),
                 changes.clone(),
                 key.clone(),
-                ActionSettings { enrollments_per_minute: 1_000_000, ..ActionSettings::default() },
+                ActionSettings {
+                    enrollments_per_minute: 1_000_000,
+                    chunk_robots,
+                    ..ActionSettings::default()
+                },
                 planner.clone(),
             )
         });

@@ -10,6 +10,7 @@ mod archives;
 mod audited;
 mod auth;
 mod bulk;
+mod chunks;
 mod cli;
 mod cli_people;
 mod cluster_rows;

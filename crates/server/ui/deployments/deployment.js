@@ -223,8 +223,11 @@ export class DeploymentView {
       this.#filteredAt = -Infinity;
     }
     if (event.type !== 'deployment' || event.deployment.id !== this.id) return;
-    this.#deployment = { ...deployment, ...event.deployment, assignments: deployment.assignments };
-    if (this.#assignments.isBehind(event.deployment.counts, performance.now())) this.#fetchSoon();
+    const { placing } = event.deployment;
+    const { assignments } = deployment;
+    this.#deployment = { ...deployment, ...event.deployment, placing, assignments };
+    const isBehind = this.#assignments.isBehind(event.deployment.counts, performance.now());
+    if (isBehind || placing || deployment.placing) this.#fetchSoon();
   }
 
   // Drawing
@@ -262,6 +265,7 @@ export class DeploymentView {
       expires_at_ms: expires,
       state,
       outdated,
+      placing,
     } = deployment;
     const isUnsettled = this.#isUnsettled;
     return html`
@@ -305,7 +309,12 @@ export class DeploymentView {
       </header>
       <p class="quiet deployment-meta">
         <span title=${selector ?? nothing}>To ${targetText(deployment, this.app.fleet)}</span>
-        · ${optionsText(deployment)}
+        · ${optionsText(deployment)}${
+          placing && state !== 'cancelled'
+            ? html` · <strong>placed for ${number(placing.placed)} of
+                ${number(placing.selected)} robots</strong>`
+            : nothing
+        }
         · created ${timeAgo(created, now)}${this.#author ? ` by ${this.#author}` : ''}${
           isUnsettled && expires > now
             ? html` · <span title=${moment(expires)}>expires in ${duration(expires - now)}</span>`

@@ -136,12 +136,27 @@ pub struct DeploymentView {
     /// Deployments that this one replaced on at least one robot; empty for users limited to some
     /// robots.
     pub supersedes: Vec<DeploymentId>,
+    /// How far a large order has got; absent once every selected robot has its assignment. Until
+    /// then the deployment is not settled, unless an operator cancelled it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub placing: Option<Placing>,
     /// Whether the deployment's version now names another package, after a forced push.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub outdated: bool,
     /// One per robot, sorted by name; only in `GET /deployments/{id}` and the answer to an order.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub assignments: Option<Vec<AssignmentView>>,
+}
+
+/// The robots of an order that is placed in several steps.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+pub struct Placing {
+    /// Number of robots that the order selected.
+    pub selected: u64,
+    /// Number of those for which the order was placed so far. They have an assignment, unless they
+    /// were removed in the meantime.
+    pub placed: u64,
 }
 
 /// Number of assignments in a phase.

@@ -16,12 +16,16 @@ pub struct UnsettledRobots<'a> {
     pub queued: Vec<&'a AssignmentView>,
     /// Offline: they continue when they are back, and the other robots don't wait for them.
     pub offline: Vec<&'a AssignmentView>,
+    /// The number of selected robots that have no assignment yet.
+    pub unplaced: u64,
 }
 
 impl DeploymentView {
     /// The robots on which the deployment has not settled; none if the view has no assignments.
     pub fn unsettled_robots(&self) -> UnsettledRobots<'_> {
-        let mut unsettled = UnsettledRobots::default();
+        let unplaced =
+            self.placing.map_or(0, |placing| placing.selected.saturating_sub(placing.placed));
+        let mut unsettled = UnsettledRobots { unplaced, ..UnsettledRobots::default() };
         for one in self.assignments.iter().flatten().filter(|one| !one.phase.is_settled(self.kind))
         {
             match (one.online, one.released) {
@@ -38,11 +42,14 @@ impl fmt::Display for UnsettledRobots<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let groups =
             [("waiting for ", &self.busy), ("next: ", &self.queued), ("offline: ", &self.offline)];
-        let parts: Vec<String> = groups
+        let mut parts: Vec<String> = groups
             .iter()
             .filter(|(_, robots)| !robots.is_empty())
             .map(|(title, robots)| format!("{title}{}", join_names(robots, MAX_NAMES)))
             .collect();
+        if self.unplaced > 0 {
+            parts.push(format!("not placed yet: {} robots", self.unplaced));
+        }
         if parts.is_empty() {
             f.write_str("settled on all robots")
         } else {

@@ -22,7 +22,7 @@ impl Actions {
     /// never approved. To be
     /// called about once a minute. Returns the users of those tokens.
     pub async fn expire(&self) -> Result<BTreeSet<UserName>, StoreError> {
-        let DeploymentActions { store, clock, changes, planner, .. } = &self.deployments;
+        let DeploymentActions { store, clock, changes, .. } = &self.deployments;
         let now_ms = clock.now_ms();
         let mut write = store.begin().await?;
         write.idempotency().delete_before(now_ms.saturating_sub(KEY_LIFETIME_MS)).await?;
@@ -32,13 +32,27 @@ impl Actions {
         let unused_ms = now_ms.saturating_sub(FAMILIAR_LIFETIME_MS);
         write.familiar_networks().delete_before(unused_ms).await?;
         let given_up = expire_pending(&mut write, now_ms).await?;
-        let overdue = write.assignments().overdue(now_ms).await?;
-        let notifications = revert(&mut write, planner, &overdue, Phase::Expired, now_ms).await?;
         write.commit().await?;
-        changes.publish(notifications);
         given_up
             .into_iter()
             .for_each(|robot| changes.announce(Change::RobotRemoved(Box::new(robot))));
+        while self.expire_assignments(now_ms).await? {}
         Ok(users)
+    }
+
+    /// Ends assignments past their time limit, as many as fit into one write. Returns whether there
+    /// may be more.
+    async fn expire_assignments(&self, now_ms: u64) -> Result<bool, StoreError> {
+        let DeploymentActions { store, changes, planner, chunk_robots: most, .. } =
+            &self.deployments;
+        let mut write = store.begin().await?;
+        let overdue = write.assignments().overdue(now_ms, *most).await?;
+        if overdue.is_empty() {
+            return Ok(false);
+        }
+        let notifications = revert(&mut write, planner, &overdue, Phase::Expired, now_ms).await?;
+        write.commit().await?;
+        changes.publish(notifications);
+        Ok(overdue.len() == *most)
     }
 }

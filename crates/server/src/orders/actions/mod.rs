@@ -16,6 +16,7 @@ use std::sync::Arc;
 use task_proto::CaPin;
 use task_proto::trust::envelope::SigningKey;
 
+use self::deployments::CHUNK_ROBOTS;
 use self::robots::EnrollmentLimits;
 use crate::auth::passwords::Passwords;
 use crate::orders::changes::Changes;
@@ -56,6 +57,8 @@ pub struct ActionSettings {
     pub ca_pin: Option<CaPin>,
     /// Whether every new robot waits to be approved.
     pub enrollment_approval: bool,
+    /// The most robots that one write places an order for, at least 1.
+    pub chunk_robots: usize,
 }
 
 const DAY_MS: u64 = 24 * 60 * 60 * 1000;
@@ -71,6 +74,7 @@ impl Default for ActionSettings {
             enrollments_per_minute: 3_000,
             ca_pin: None,
             enrollment_approval: false,
+            chunk_robots: CHUNK_ROBOTS,
         }
     }
 }
@@ -113,6 +117,8 @@ impl Actions {
                 changes,
                 planner,
                 assignment_lifetime_ms: settings.assignment_lifetime_ms,
+                chunk_robots: settings.chunk_robots,
+                to_continue: Arc::default(),
             },
         }
     }

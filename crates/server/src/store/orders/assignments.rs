@@ -9,9 +9,9 @@ use task_proto::messages::report::Phase;
 use task_proto::{DeploymentId, RobotId, TaskName};
 
 use crate::store::repositories::Assignments;
-use crate::store::rows::{deployment_robot_pairs, groups, id, stored, values};
+use crate::store::rows::{deployment_robot_pairs, groups, id, json, stored, values};
 use crate::store::timelines::{appended_phase, step};
-use crate::store::{StoreError, Transaction};
+use crate::store::{OrderChunk, StoreError, Transaction};
 
 /// An order on a task that a robot has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -36,23 +36,23 @@ pub struct ReleasedBatch {
 }
 
 impl Assignments<&mut Transaction> {
-    /// Gives each of `robots`, in this order, its part of a new deployment. Nothing is released
-    /// yet. Older parts of the same task that wait for their batch end, and their deployments are
-    /// returned.
+    /// Gives each of `robots` that is still registered its part of a deployment, in this order, from
+    /// `first_place` on. Nothing is released yet.
     pub async fn insert(
         &mut self,
         deployment: &DeploymentId,
         task: &TaskName,
         robots: &[RobotId],
+        first_place: u64,
         now_ms: u64,
-    ) -> Result<BTreeSet<DeploymentId>, StoreError> {
-        let mut place = 0;
+    ) -> Result<(), StoreError> {
+        let mut place = stored(first_place);
         for group in groups(robots) {
             let sql = format!(
                 "WITH v (robot_id, place) AS ({})
                  INSERT INTO assignments (deployment_id, robot_id, task, place, updated_at_ms, timeline)
                  SELECT CAST($1 AS TEXT), v.robot_id, CAST($2 AS TEXT), v.place, CAST($3 AS BIGINT), CAST($4 AS TEXT)
-                 FROM v",
+                 FROM v JOIN robots r ON r.id = v.robot_id WHERE r.removed_at_ms IS NULL",
                 values(5, group.len(), &["TEXT", "BIGINT"])
             );
             let mut query = sqlx::query(AssertSqlSafe(sql))
@@ -66,45 +66,127 @@ impl Assignments<&mut Transaction> {
             }
             query.execute(self.0.connection()).await?;
         }
+        Ok(())
+    }
+
+    /// Ends older parts of the task that wait for their batch, on the robots that wait in
+    /// `deployment` from `first_place` on. Returns the deployments of these parts.
+    pub async fn supersede_waiting(
+        &mut self,
+        deployment: &DeploymentId,
+        task: &TaskName,
+        first_place: u64,
+        now_ms: u64,
+    ) -> Result<BTreeSet<DeploymentId>, StoreError> {
         let superseded = sqlx::query_scalar(AssertSqlSafe(format!(
             "UPDATE assignments SET phase = 'superseded', ended = 1, superseded_by = $1, updated_at_ms = $3,
                  timeline = {}
              WHERE task = $2 AND released = 0 AND ended = 0 AND deployment_id <> $1
-               AND robot_id IN (SELECT robot_id FROM assignments WHERE deployment_id = $1)
+               AND robot_id IN (SELECT robot_id FROM assignments
+                   WHERE deployment_id = $1 AND released = 0 AND ended = 0 AND place >= $4)
              RETURNING deployment_id",
             appended_phase(Phase::Superseded, "$3")
         )))
         .bind(deployment.as_str())
         .bind(task.as_str())
         .bind(stored(now_ms))
+        .bind(stored(first_place))
         .fetch_all(self.0.connection())
         .await?;
         deployments(superseded)
     }
 
-    /// Settles a new deployment on the robots that run its package already, as of their last
-    /// report: nothing begins there. Their desired state stays the earlier deployment, so that they
-    /// receive nothing new.
+    /// Takes a deployment's parts away from `robots`, which were just placed from `first_place` on,
+    /// as [`Self::drop_waiting`] does.
+    pub async fn drop_from(
+        &mut self,
+        deployment: &DeploymentId,
+        first_place: u64,
+        robots: &[RobotId],
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
+        if robots.is_empty() {
+            return Ok(());
+        }
+        let sql = format!(
+            "UPDATE assignments SET phase = 'cancelled', ended = 1, wanted = 'stopped', updated_at_ms = $2,
+                 timeline = {}
+             WHERE deployment_id = $1 AND released = 0 AND ended = 0 AND place >= $3 AND robot_id IN ({})",
+            appended_phase(Phase::Cancelled, "$2"),
+            self.0.dialect.texts(4)
+        );
+        sqlx::query(AssertSqlSafe(sql))
+            .bind(deployment.as_str())
+            .bind(stored(now_ms))
+            .bind(stored(first_place))
+            .bind(json(&robots))
+            .execute(self.0.connection())
+            .await?;
+        Ok(())
+    }
+
+    /// Ends parts of a chunk that was just placed, on robots that have received a newer order for
+    /// the task since: as a part that waits for its batch, they would have ended with that order.
+    pub async fn yield_to_newer(
+        &mut self,
+        chunk: &OrderChunk,
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
+        let newer: Option<String> = sqlx::query_scalar(
+            "SELECT id FROM deployments WHERE number > $1 AND task = $2 LIMIT 1",
+        )
+        .bind(stored(chunk.number))
+        .bind(chunk.task.as_str())
+        .fetch_optional(self.0.connection())
+        .await?;
+        if newer.is_none() {
+            return Ok(());
+        }
+        let newer = "FROM assignments newer JOIN deployments d ON d.id = newer.deployment_id
+             WHERE newer.robot_id = assignments.robot_id AND newer.task = assignments.task AND d.number > $4";
+        let sql = format!(
+            "UPDATE assignments SET phase = 'superseded', ended = 1, updated_at_ms = $2, timeline = {},
+                 superseded_by = (SELECT d.id {newer} ORDER BY d.number LIMIT 1)
+             WHERE deployment_id = $1 AND released = 0 AND ended = 0 AND place >= $3
+               AND EXISTS (SELECT 1 {newer})",
+            appended_phase(Phase::Superseded, "$2")
+        );
+        sqlx::query(AssertSqlSafe(sql))
+            .bind(chunk.deployment.as_str())
+            .bind(stored(now_ms))
+            .bind(stored(chunk.first_place))
+            .bind(stored(chunk.number))
+            .execute(self.0.connection())
+            .await?;
+        Ok(())
+    }
+
+    /// Settles a new deployment on the robots from `first_place` on that run its package already, as
+    /// of their last report: nothing begins there. Their desired state stays the earlier
+    /// deployment, so that they receive nothing new.
     pub async fn settle_running(
         &mut self,
         deployment: &DeploymentId,
+        first_place: u64,
         now_ms: u64,
     ) -> Result<(), StoreError> {
         // The same package has the same text.
         sqlx::query(AssertSqlSafe(format!(
             "UPDATE assignments SET released = 1, ended = 1, ran = 1, phase = 'running', updated_at_ms = $2, timeline = {}
-             WHERE deployment_id = $1 AND released = 0 AND ended = 0 AND robot_id IN (
-                 SELECT has.robot_id FROM deployments ordered
+             WHERE deployment_id = $1 AND released = 0 AND ended = 0 AND place >= $3 AND EXISTS (
+                 SELECT 1 FROM deployments ordered
                  JOIN assignments has ON has.task = ordered.task AND has.desired = 1
                  JOIN deployments present ON present.id = has.deployment_id
                  JOIN robots r ON r.id = has.robot_id
-                 WHERE ordered.id = $1 AND ordered.kind = 'service' AND present.package = ordered.package
+                 WHERE ordered.id = $1 AND has.robot_id = assignments.robot_id
+                   AND ordered.kind = 'service' AND present.package = ordered.package
                    AND has.wanted = 'running' AND has.phase = 'running'
                    AND r.observed_generation <= r.generation)",
             appended_phase(Phase::Running, "$2")
         )))
         .bind(deployment.as_str())
         .bind(stored(now_ms))
+        .bind(stored(first_place))
         .execute(self.0.connection())
         .await?;
         Ok(())
@@ -116,20 +198,23 @@ impl Assignments<&mut Transaction> {
         deployment: &DeploymentId,
         robots: &[&RobotId],
     ) -> Result<(), StoreError> {
-        let last: Option<i64> =
-            sqlx::query_scalar("SELECT MAX(place) FROM assignments WHERE deployment_id = $1")
-                .bind(deployment.as_str())
-                .fetch_one(self.0.connection())
-                .await?;
+        // Robots that have no assignment yet have their places as well.
+        let (last, selected): (Option<i64>, Option<i64>) = sqlx::query_as(
+            "SELECT (SELECT MAX(place) FROM assignments WHERE deployment_id = $1), selected
+             FROM deployments WHERE id = $1",
+        )
+        .bind(deployment.as_str())
+        .fetch_one(self.0.connection())
+        .await?;
+        let last = last.max(selected).unwrap_or(0);
         for group in groups(robots) {
             let sql = format!(
                 "WITH v (id) AS ({}) UPDATE assignments SET place = place + $2 FROM v
                  WHERE deployment_id = $1 AND robot_id = v.id AND released = 0 AND ended = 0",
                 values(3, group.len(), &["TEXT"])
             );
-            let mut query = sqlx::query(AssertSqlSafe(sql))
-                .bind(deployment.as_str())
-                .bind(last.unwrap_or(0) + 1);
+            let mut query =
+                sqlx::query(AssertSqlSafe(sql)).bind(deployment.as_str()).bind(last + 1);
             for robot in group {
                 query = query.bind(robot.as_str());
             }

@@ -5,7 +5,7 @@ use std::collections::{BTreeSet, HashMap, HashSet};
 use sqlx::{AssertSqlSafe, Row as _};
 use task_proto::api::{
     AssignmentView, CreateDeployment, DeliveryChoice, DeliveryDecision, DeploymentState,
-    DeploymentView, PhaseCount, TimelineEntry,
+    DeploymentView, PhaseCount, Placing, TimelineEntry,
 };
 use task_proto::desired::PackageRef;
 use task_proto::ids::selector::Selector;
@@ -33,6 +33,10 @@ pub struct NewDeployment<'a> {
     /// Whether the task is a service or a job.
     pub kind: TaskKind,
     pub order: &'a CreateDeployment,
+    /// The number of robots that the order selects.
+    pub selected: u64,
+    /// The number of these robots for which the order is placed in the same write.
+    pub placed: u64,
     /// The time at which unfinished assignments expire.
     pub expires_at_ms: u64,
 }
@@ -41,9 +45,10 @@ pub struct NewDeployment<'a> {
 #[derive(Debug)]
 pub struct OpenRollout {
     pub rollout: Rollout,
-    /// The number of robots on which the deployment has failed.
+    /// The number of robots on which the deployment has failed; 0 if the order tolerates any number.
     pub failed: u64,
-    /// The unsettled robots, in the order of their turns.
+    /// The unsettled robots, in the order of their turns. Without batches and a limit of failures,
+    /// only the robots that wait.
     pub robots: Vec<OpenRobot>,
 }
 
@@ -87,6 +92,8 @@ pub struct DeploymentRow {
     pub counts: Vec<PhaseCount>,
     /// The deployments that this one replaced on at least one robot.
     pub supersedes: Vec<DeploymentId>,
+    /// How far the order is placed, if it isn't for some of its robots.
+    pub placing: Option<Placing>,
     /// Whether the version now names another package.
     pub is_outdated: bool,
 }
@@ -112,7 +119,8 @@ pub struct AssignmentRow {
 impl DeploymentRow {
     /// The state of the deployment as a whole.
     pub fn state(&self) -> DeploymentState {
-        deployment::state(self.kind, self.is_cancelled, self.is_paused, &self.counts)
+        let is_placing = self.placing.is_some();
+        deployment::state(self.kind, self.is_cancelled, self.is_paused, is_placing, &self.counts)
     }
 
     /// The deployment as operators see it; `None`: without assignments, as in lists.
@@ -131,6 +139,7 @@ impl DeploymentRow {
             expires_at_ms: self.expires_at_ms,
             counts: self.counts,
             supersedes: self.supersedes,
+            placing: self.placing,
             outdated: self.is_outdated,
             assignments,
         }
@@ -278,6 +287,7 @@ impl Deployments<&Store> {
         let sql = format!(
             "{} SELECT DISTINCT d.package FROM deployments d WHERE d.id IN (
                  SELECT deployment_id FROM assignments WHERE ended = 0
+                 UNION SELECT deployment_id FROM order_chunks
                  UNION SELECT deployment_id FROM needed
                  UNION SELECT previous FROM assignments WHERE desired = 1 AND previous IS NOT NULL)",
             with_needed_where("desired = 1")
@@ -369,8 +379,8 @@ impl Deployments<&mut Transaction> {
         let number = stored(self.0.sequence());
         sqlx::query(
             "INSERT INTO deployments (id, number, task, version, package, kind, selector, delivery, batch, max_failures,
-                 created_at_ms, expires_at_ms, priority)
-             VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13)",
+                 created_at_ms, expires_at_ms, priority, selected, placed, restart)
+             VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13, $14, $15, $16)",
         )
         .bind(new.id.as_str())
         .bind(number)
@@ -385,6 +395,9 @@ impl Deployments<&mut Transaction> {
         .bind(stored(now_ms))
         .bind(stored(new.expires_at_ms))
         .bind(i64::from(new.order.priority))
+        .bind(stored(new.selected))
+        .bind(stored(new.placed))
+        .bind(i64::from(new.order.restart))
         .execute(self.0.connection())
         .await?;
         Ok(())
@@ -403,7 +416,7 @@ impl Deployments<&mut Transaction> {
     /// The pace and the open robots of a deployment with waiting robots; `None` for any other.
     pub async fn rollout(&mut self, id: &DeploymentId) -> Result<Option<OpenRollout>, StoreError> {
         let row = sqlx::query(
-            "SELECT kind, batch, max_failures, forgiven, paused FROM deployments
+            "SELECT kind, batch, max_failures, forgiven, paused, selected, placed FROM deployments
              WHERE id = $1 AND cancelled_at_ms IS NULL AND EXISTS (
                  SELECT 1 FROM assignments WHERE deployment_id = $1 AND released = 0 AND ended = 0)",
         )
@@ -417,7 +430,12 @@ impl Deployments<&mut Transaction> {
             max_failures: row.try_get::<Option<i64>, _>("max_failures")?.map(number),
             forgiven: number(row.try_get("forgiven")?),
             paused: row.try_get::<i64, _>("paused")? == 1,
+            is_placing: placing(&row)?.is_some(),
         };
+        if rollout.batch.is_none() && rollout.max_failures.is_none() {
+            let robots = self.open_robots(id, kind, "AND a.released = 0").await?;
+            return Ok(Some(OpenRollout { rollout, failed: 0, robots }));
+        }
         let phase_counts: Vec<(String, i64)> = sqlx::query_as(
             "SELECT phase, COUNT(*) FROM assignments WHERE deployment_id = $1 GROUP BY phase",
         )
@@ -428,22 +446,25 @@ impl Deployments<&mut Transaction> {
             .iter()
             .filter(|(phase, _)| deployment::is_failure(Phase::from_text(phase), kind));
         let failed = failures.map(|(_, count)| number(*count)).sum();
-        Ok(Some(OpenRollout { rollout, failed, robots: self.open_robots(id, kind).await? }))
+        Ok(Some(OpenRollout { rollout, failed, robots: self.open_robots(id, kind, "").await? }))
     }
 
-    /// The unsettled robots of a deployment, in the order of their turns.
+    /// The unsettled robots of a deployment that meet a further condition, in the order of their
+    /// turns.
     async fn open_robots(
         &mut self,
         deployment: &DeploymentId,
         kind: TaskKind,
+        condition: &str,
     ) -> Result<Vec<OpenRobot>, StoreError> {
-        let rows: Vec<(String, i64, String, i64, i64)> = sqlx::query_as(
+        let rows: Vec<(String, i64, String, i64, i64)> = sqlx::query_as(AssertSqlSafe(format!(
             "SELECT a.robot_id, a.released, a.phase, a.ran,
                  CAST(CASE WHEN r.revoked_at_ms IS NULL THEN 0 ELSE 1 END AS BIGINT)
              FROM assignments a JOIN robots r ON r.id = a.robot_id
              WHERE a.deployment_id = $1 AND a.ended = 0 AND NOT (a.phase = 'running' AND $2 = 'service')
-             ORDER BY a.place",
-        )
+                 {condition}
+             ORDER BY a.place"
+        )))
         .bind(deployment.as_str())
         .bind(word(&kind))
         .fetch_all(self.0.connection())
@@ -499,6 +520,32 @@ impl Deployments<&mut Transaction> {
         self.update("UPDATE deployments SET cancelled_at_ms = $2 WHERE id = $1", id, now_ms).await
     }
 
+    /// Stores the place from which a cancelled deployment is still to be taken away from robots;
+    /// `None`: from none.
+    pub async fn set_cancel_from(
+        &mut self,
+        id: &DeploymentId,
+        place: Option<u64>,
+    ) -> Result<(), StoreError> {
+        sqlx::query("UPDATE deployments SET cancel_from = $2 WHERE id = $1")
+            .bind(id.as_str())
+            .bind(place.map(stored))
+            .execute(self.0.connection())
+            .await?;
+        Ok(())
+    }
+
+    /// The oldest cancelled deployment that is still to be taken away from robots, and the place to
+    /// go on from.
+    pub async fn next_to_cancel(&mut self) -> Result<Option<(DeploymentId, u64)>, StoreError> {
+        let sql = "SELECT id, cancel_from FROM deployments WHERE cancel_from IS NOT NULL
+             ORDER BY number LIMIT 1";
+        let row: Option<(String, i64)> =
+            sqlx::query_as(sql).fetch_optional(self.0.connection()).await?;
+        row.map(|(deployment, place)| Ok((id("deployments.id", &deployment)?, number(place))))
+            .transpose()
+    }
+
     async fn update(
         &mut self,
         sql: &'static str,
@@ -514,7 +561,7 @@ impl Deployments<&mut Transaction> {
 fn select(selector: &str) -> String {
     format!(
         "SELECT id, number, package, kind, {selector} AS selector, delivery, priority, batch, max_failures,
-             paused, created_at_ms, expires_at_ms, cancelled_at_ms
+             paused, created_at_ms, expires_at_ms, cancelled_at_ms, selected, placed
          FROM deployments"
     )
 }
@@ -544,8 +591,17 @@ fn deployment_row(
         expires_at_ms: number(row.try_get("expires_at_ms")?),
         counts,
         supersedes,
+        placing: placing(row)?,
         is_outdated,
     })
+}
+
+/// How far an order is placed; `None`: for all its robots.
+fn placing(row: &sqlx::any::AnyRow) -> Result<Option<Placing>, StoreError> {
+    let read =
+        |column| row.try_get::<Option<i64>, _>(column).map(|count| number(count.unwrap_or(0)));
+    let placing = Placing { selected: read("selected")?, placed: read("placed")? };
+    Ok((placing.placed < placing.selected).then_some(placing))
 }
 
 fn assignment_row(row: &sqlx::any::AnyRow) -> Result<AssignmentRow, StoreError> {

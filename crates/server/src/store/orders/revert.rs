@@ -3,6 +3,7 @@
 //! restart was not carried out, nothing is replaced: the task is left as it is.
 
 use std::collections::BTreeSet;
+use std::ops::RangeInclusive;
 
 use sqlx::{AssertSqlSafe, Row as _};
 use task_proto::desired::TargetState;
@@ -22,6 +23,8 @@ use crate::store::{StoreError, Transaction};
 pub struct Revocable {
     pub deployment: DeploymentId,
     pub robot: RobotId,
+    /// The place of the robot in the deployment.
+    pub place: u64,
     /// The deployment that this one replaced, which becomes desired again.
     pub previous: Option<DeploymentId>,
     desired: bool,
@@ -47,26 +50,32 @@ const PAIR_COLUMNS: &[&str] = &["TEXT", "TEXT"];
 const RETAINED_COLUMNS: &[&str] = &["TEXT", "TEXT", "BIGINT", "TEXT", "TEXT", "BIGINT", "TEXT"];
 /// The columns that [`revocable`] reads. A robot's report is only read if the task has run there.
 const COLUMNS: &str =
-    "a.deployment_id, a.robot_id, a.desired, a.previous, a.wanted, a.run, a.ran, a.phase,
+    "a.deployment_id, a.robot_id, a.place, a.desired, a.previous, a.wanted, a.run, a.ran, a.phase,
      CASE WHEN a.ran = 1 THEN r.report END AS report,
      CAST(CASE WHEN r.observed_generation > r.generation THEN 1 ELSE 0 END AS BIGINT) AS diverged";
 
 impl Assignments<&mut Transaction> {
-    /// The assignments that a cancel revokes: all unsettled ones, and those that ended without
-    /// success but are still desired. A running service has settled: there is nothing left to
-    /// interrupt.
+    /// The first assignments in these places that a cancel revokes, at most `most`: all unsettled
+    /// ones, and those that ended without success but are still desired. A running service has
+    /// settled: there is nothing left to interrupt.
     pub async fn revocable(
         &mut self,
         deployment: &DeploymentId,
+        places: RangeInclusive<u64>,
+        most: usize,
     ) -> Result<Vec<Revocable>, StoreError> {
         let rows = sqlx::query(AssertSqlSafe(format!(
             "SELECT {COLUMNS} FROM assignments a
              JOIN deployments d ON d.id = a.deployment_id JOIN robots r ON r.id = a.robot_id
              WHERE a.deployment_id = $1 AND NOT (a.phase = 'running' AND d.kind = 'service')
                AND (a.ended = 0 OR (a.desired = 1 AND a.phase NOT IN ('succeeded', 'stopped')))
-             ORDER BY a.place"
+               AND a.place BETWEEN $2 AND $3
+             ORDER BY a.place LIMIT $4"
         )))
         .bind(deployment.as_str())
+        .bind(stored(*places.start()))
+        .bind(stored(*places.end()))
+        .bind(stored(most as u64))
         .fetch_all(self.0.connection())
         .await?;
         // A task that is on its way to run, or runs, is interrupted. An order to run once more is
@@ -87,12 +96,18 @@ impl Assignments<&mut Transaction> {
         Ok(count > 0)
     }
 
-    pub async fn overdue(&mut self, now_ms: u64) -> Result<Vec<Revocable>, StoreError> {
+    /// Assignments past their time limit, at most `most`.
+    pub async fn overdue(
+        &mut self,
+        now_ms: u64,
+        most: usize,
+    ) -> Result<Vec<Revocable>, StoreError> {
         let rows = sqlx::query(AssertSqlSafe(format!(
             "SELECT {COLUMNS} FROM assignments a JOIN robots r ON r.id = a.robot_id
-             WHERE a.ended = 0 AND a.expires_at_ms <= $1"
+             WHERE a.ended = 0 AND a.expires_at_ms <= $1 LIMIT $2"
         )))
         .bind(stored(now_ms))
+        .bind(stored(most as u64))
         .fetch_all(self.0.connection())
         .await?;
         rows.iter().map(|row| revocable(row, |_| true)).collect()
@@ -300,6 +315,7 @@ fn revocable(
     };
     Ok(Revocable {
         robot: id("assignments.robot_id", row.try_get("robot_id")?)?,
+        place: number(row.try_get("place")?),
         previous: previous.map(|previous| id("assignments.previous", &previous)).transpose()?,
         deployment,
         desired,

@@ -8,7 +8,7 @@ use task_proto::messages::report::{Phase, Report};
 use task_proto::{DeploymentId, RobotId, TaskName};
 
 use crate::store::repositories::Assignments;
-use crate::store::rows::{from_json, id};
+use crate::store::rows::{from_json, id, stored};
 use crate::store::timelines::appended_phase;
 use crate::store::{StoreError, Transaction};
 
@@ -23,15 +23,17 @@ pub struct StillRunning {
 }
 
 impl Assignments<&mut Transaction> {
-    /// Settles a new deployment of `task` on the robots that, as of their last reports, still run
-    /// its package after a later one failed. Returns these robots: their desired state is new.
+    /// Settles a new deployment of `task` on the robots from `first_place` on that, as of their last
+    /// reports, still run its package after a later one failed. Returns these robots: their desired
+    /// state is new.
     pub async fn settle_still_running(
         &mut self,
         deployment: &DeploymentId,
         task: &TaskName,
+        first_place: u64,
         now_ms: u64,
     ) -> Result<Vec<StillRunning>, StoreError> {
-        let found = self.still_running(deployment, task).await?;
+        let found = self.still_running(deployment, task, first_place).await?;
         if found.is_empty() {
             return Ok(found);
         }
@@ -77,12 +79,14 @@ impl Assignments<&mut Transaction> {
         &mut self,
         deployment: &DeploymentId,
         task: &TaskName,
+        first_place: u64,
     ) -> Result<Vec<StillRunning>, StoreError> {
         // The same package has the same text.
         let rows = sqlx::query(
             "SELECT new.robot_id, has.deployment_id AS failed, earlier.deployment_id AS earlier, r.report
              FROM deployments ordered
              JOIN assignments new ON new.deployment_id = ordered.id AND new.released = 0 AND new.ended = 0
+                 AND new.place >= $3
              JOIN assignments has ON has.robot_id = new.robot_id AND has.task = $2 AND has.desired = 1
              JOIN deployments present ON present.id = has.deployment_id
              JOIN assignments earlier ON earlier.robot_id = new.robot_id AND earlier.task = $2
@@ -95,6 +99,7 @@ impl Assignments<&mut Transaction> {
         )
         .bind(deployment.as_str())
         .bind(task.as_str())
+        .bind(stored(first_place))
         .fetch_all(self.0.connection())
         .await?;
         let mut found = Vec::new();

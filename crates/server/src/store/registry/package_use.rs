@@ -264,7 +264,9 @@ impl Packages<&mut Transaction> {
     ) -> Result<PackageUsers, StoreError> {
         let rows: Vec<(String, String)> = sqlx::query_as(
             "SELECT id, package FROM deployments WHERE id IN (
-                 SELECT deployment_id FROM assignments WHERE (desired = 1 OR ended = 0) AND task = $1)
+                 SELECT deployment_id FROM assignments WHERE (desired = 1 OR ended = 0) AND task = $1
+                 UNION SELECT c.deployment_id FROM order_chunks c JOIN deployments d ON d.id = c.deployment_id
+                 WHERE d.task = $1)
              ORDER BY number",
         )
         .bind(name.as_str())

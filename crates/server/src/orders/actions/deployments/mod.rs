@@ -1,19 +1,20 @@
-//! Orders about deployments and tasks. This file creates, cancels and resumes deployments; retries,
-//! rollbacks, tasks and the fallback to pull have files of their own.
+//! Orders about deployments and tasks. This file creates, cancels and resumes deployments; placing,
+//! retries, rollbacks, tasks and the fallback to pull have files of their own.
 
+mod placement;
 mod pull_fallback;
 mod retry_rollback;
 mod tasks;
 
 use std::collections::BTreeSet;
+use std::sync::Arc;
 
 use task_proto::api::{CreateDeployment, DeliveryChoice, MAX_PRIORITY, MIN_PRIORITY, PackageView};
-use task_proto::desired::PackageRef;
 use task_proto::ids::selector::Selector;
 use task_proto::messages::report::Phase;
-use task_proto::packages::manifest::TaskKind;
 use task_proto::size::format_bytes;
 use task_proto::{DeploymentId, RobotId, TaskName, Version};
+use tokio::sync::Notify;
 
 use super::idempotency::{IdempotencyKey, store_answer, stored_answer};
 use super::selection::{check_scope, preview, select};
@@ -24,11 +25,12 @@ use crate::orders::changes::{Changes, PendingNotifications};
 use crate::orders::delivery_planner::{DeliveryPlanner, transfer_bytes};
 use crate::orders::rollout;
 use crate::store::{
-    AuditAction, AuditEvent, NewDeployment, Revocable, SelectedRobot, StillRunning, Store,
-    StoreError, Transaction,
+    AuditAction, AuditEvent, Revocable, SelectedRobot, Store, StoreError, Transaction,
 };
 use crate::system::clock::Clock;
 
+pub use placement::CHUNK_ROBOTS;
+use placement::{Placement, Room};
 pub use retry_rollback::Rollback;
 
 /// Orders about deployments, and about tasks that robots have. Clones share their state.
@@ -40,6 +42,10 @@ pub struct DeploymentActions {
     pub(super) planner: DeliveryPlanner,
     /// Default time limit of an assignment.
     pub(super) assignment_lifetime_ms: u64,
+    /// The most robots that one write places an order for.
+    pub(super) chunk_robots: usize,
+    /// Notified of orders that were too large for one write.
+    pub(super) to_continue: Arc<Notify>,
 }
 
 /// Why an order about a deployment or a task was refused.
@@ -127,7 +133,10 @@ impl DeploymentActions {
         let placement =
             Placement { package: &package.package, kind, order, robots: &robots, expires_at_ms };
         let mut notifications = PendingNotifications::default();
-        let id = placement.place(&mut write, &self.planner, now_ms, &mut notifications).await?;
+        let mut room = Room::of(self.chunk_robots);
+        let id = placement
+            .place(&mut write, &self.planner, &mut room, now_ms, &mut notifications)
+            .await?;
         let task = &package.package.name;
         let event = AuditEvent::by(by, AuditAction::DeploymentCreate, &id)
             .with("package", format!("{task} {}", package.package.version))
@@ -138,6 +147,7 @@ impl DeploymentActions {
         store_answer(&mut write, by, key, &request, &id, now_ms).await?;
         write.commit().await?;
         self.changes.publish(notifications);
+        self.to_continue.notify_one();
         Ok(id)
     }
 
@@ -185,8 +195,9 @@ impl DeploymentActions {
     }
 
     /// Cancels a deployment: where the deployment has not settled, the package it replaced is
-    /// desired again; a running service goes on. The call is idempotent; a deployment that is over
-    /// everywhere is left unchanged.
+    /// desired again; a running service goes on; robots that it was not placed for are left alone.
+    /// If it has many robots, further writes follow for the others. The call is idempotent; a
+    /// deployment that is over everywhere is left unchanged.
     pub async fn cancel(&self, by: &Person, id: &DeploymentId) -> Result<(), DeploymentError> {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
@@ -195,25 +206,46 @@ impl DeploymentActions {
         if is_cancelled {
             return Ok(());
         }
-        let robots: Vec<RobotId> =
-            write.assignments().revocable(id).await?.into_iter().map(|row| row.robot).collect();
-        if robots.is_empty() && !write.assignments().may_be_restored(id).await? {
+        let is_placing = write.order_chunks().remove_all(id).await?;
+        let is_over = write.assignments().revocable(id, 0..=u64::MAX, 1).await?.is_empty();
+        if is_over && !is_placing && !write.assignments().may_be_restored(id).await? {
             return Err(DeploymentError::NothingToCancel(id.clone()));
         }
-        write.robots().adopt_diverged(&robots, now_ms).await?;
         write.deployments().mark_cancelled(id, now_ms).await?;
-        let taken = write.assignments().revocable(id).await?;
-        let mut notifications =
-            revert(&mut write, &self.planner, &taken, Phase::Cancelled, now_ms).await?;
-        write.assignments().skip_in_rollback_chain(id).await?;
-        notifications.deployments.insert(id.clone());
+        let notifications = self.cancel_from(&mut write, id, 0, now_ms).await?;
         write
             .audit()
             .record(&AuditEvent::by(by, AuditAction::DeploymentCancel, id), now_ms)
             .await?;
         write.commit().await?;
         self.changes.publish(notifications);
+        self.to_continue.notify_one();
         Ok(())
+    }
+
+    /// Takes a cancelled deployment away from as many robots as fit into one write, from a place in
+    /// the deployment on.
+    async fn cancel_from(
+        &self,
+        write: &mut Transaction,
+        id: &DeploymentId,
+        place: u64,
+        now_ms: u64,
+    ) -> Result<PendingNotifications, StoreError> {
+        let most = self.chunk_robots;
+        let found = write.assignments().revocable(id, place..=u64::MAX, most).await?;
+        let last = found.last().filter(|_| found.len() == most).map(|row| row.place);
+        let robots: Vec<RobotId> = found.into_iter().map(|row| row.robot).collect();
+        write.robots().adopt_diverged(&robots, now_ms).await?;
+        // Assignments that were adopted from robots share one place.
+        let places = place..=last.unwrap_or(u64::MAX);
+        let taken = write.assignments().revocable(id, places, usize::MAX).await?;
+        let mut notifications =
+            revert(write, &self.planner, &taken, Phase::Cancelled, now_ms).await?;
+        write.assignments().skip_in_rollback_chain(id).await?;
+        write.deployments().set_cancel_from(id, last.map(|last| last + 1)).await?;
+        notifications.deployments.insert(id.clone());
+        Ok(notifications)
     }
 
     /// Resumes a paused deployment; the failures so far no longer count. If the deployment is not
@@ -272,47 +304,6 @@ impl DeploymentActions {
             rollout::advance(&self.store, &self.planner, open, self.clock.now_ms()).await?;
         self.changes.publish(notifications);
         Ok(())
-    }
-}
-
-/// A package that is ordered on robots.
-struct Placement<'a> {
-    package: &'a PackageRef,
-    kind: TaskKind,
-    /// The order to place.
-    order: &'a CreateDeployment,
-    robots: &'a [RobotId],
-    expires_at_ms: u64,
-}
-
-impl Placement<'_> {
-    /// Stores the deployment with its assignments, and advances all deployments that may go on now,
-    /// including this one. Where the package runs already, nothing begins unless `restart` is set.
-    async fn place(
-        &self,
-        write: &mut Transaction,
-        planner: &DeliveryPlanner,
-        now_ms: u64,
-        notifications: &mut PendingNotifications,
-    ) -> Result<DeploymentId, StoreError> {
-        let &Self { package, kind, order, robots, expires_at_ms } = self;
-        let id = DeploymentId::random();
-        let new = NewDeployment { id: &id, package, kind, order, expires_at_ms };
-        write.deployments().insert(&new, now_ms).await?;
-        let mut touched = write.assignments().insert(&id, &package.name, robots, now_ms).await?;
-        if !order.restart {
-            write.assignments().settle_running(&id, now_ms).await?;
-            for StillRunning { robot, failed, earlier } in
-                write.assignments().settle_still_running(&id, &package.name, now_ms).await?
-            {
-                notifications.to_notify.insert(robot);
-                notifications.deployments.extend([failed, earlier]);
-            }
-        }
-        touched.insert(id.clone());
-        notifications.deployments.extend(touched.iter().cloned());
-        rollout::apply(write, planner, touched, now_ms, notifications).await?;
-        Ok(id)
     }
 }
 

@@ -10,7 +10,7 @@ use task_proto::packages::manifest::TaskKind;
 use task_proto::{DeploymentId, Digest, RobotId, TaskName};
 
 use super::tasks::robots_with_task;
-use super::{DeploymentActions, DeploymentError, Placement};
+use super::{DeploymentActions, DeploymentError, Placement, Room};
 use crate::domain::person::Person;
 use crate::orders::actions::OrderError;
 use crate::orders::actions::idempotency::{
@@ -104,7 +104,10 @@ impl DeploymentActions {
             expires_at_ms,
         };
         let mut notifications = PendingNotifications::default();
-        let new = placement.place(&mut write, &self.planner, now_ms, &mut notifications).await?;
+        let mut room = Room::of(self.chunk_robots);
+        let new = placement
+            .place(&mut write, &self.planner, &mut room, now_ms, &mut notifications)
+            .await?;
         let event = AuditEvent::by(by, AuditAction::DeploymentRetry, &new)
             .with("of", id)
             .with("package", format!("{} {}", package.package.name, package.package.version))
@@ -115,6 +118,7 @@ impl DeploymentActions {
         store_answer(&mut write, by, key, &request, &new, now_ms).await?;
         write.commit().await?;
         self.changes.publish(notifications);
+        self.to_continue.notify_one();
         Ok(new)
     }
 
@@ -151,7 +155,8 @@ impl DeploymentActions {
             return Err(DeploymentError::NothingToRollBack(task.clone()));
         }
         let expires_at_ms = now_ms + self.assignment_lifetime_ms;
-        let mut notifications = PendingNotifications::default();
+        let (mut room, mut notifications) =
+            (Room::of(self.chunk_robots), PendingNotifications::default());
         for (package, kind, robots) in targets {
             let order =
                 CreateDeployment::new(task.clone(), package.manifest.digest, selector.clone());
@@ -162,7 +167,9 @@ impl DeploymentActions {
                 robots: &robots,
                 expires_at_ms,
             };
-            let id = placement.place(&mut write, &self.planner, now_ms, &mut notifications).await?;
+            let id = placement
+                .place(&mut write, &self.planner, &mut room, now_ms, &mut notifications)
+                .await?;
             rollback.deployments.push(id);
         }
         let deployments: Vec<&str> =
@@ -175,6 +182,7 @@ impl DeploymentActions {
         store_answer(&mut write, by, key, &request, &rollback, now_ms).await?;
         write.commit().await?;
         self.changes.publish(notifications);
+        self.to_continue.notify_one();
         Ok(rollback)
     }
 

@@ -43,6 +43,7 @@ impl DeploymentActions {
         }
         if matches!(order, TaskOrder::Stop | TaskOrder::Remove) {
             touched.extend(write.assignments().drop_waiting(Some(task), &ids, now_ms).await?);
+            touched.extend(write.order_chunks().drop_robots(task, &ids).await?);
         }
         notifications.deployments.extend(touched.iter().cloned());
         rollout::apply(&mut write, &self.planner, touched, now_ms, &mut notifications).await?;

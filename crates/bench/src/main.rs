@@ -13,6 +13,7 @@ use taskbench::scenario::blob::{self, BlobFlags};
 use taskbench::scenario::broker::{self, BrokerFlags};
 use taskbench::scenario::fleet::{self, FleetFlags};
 use taskbench::scenario::load::{Load, LoadFlags};
+use taskbench::scenario::orders::{self, OrdersFlags};
 use taskbench::scenario::page::{self, PageFlags};
 use taskbench::scenario::paper::{self, PaperFlags};
 use taskbench::scenario::pull::{self, PullFlags};
@@ -102,6 +103,16 @@ enum Command {
     )]
     Status(StatusFlags),
 
+    /// Order packages for a whole fleet of rows, and time how long that stops other robots' reports
+    ///
+    /// Most robots are only in the database, without sessions; a few are connected and report at a
+    /// fixed rate. Packages for all robots, for those with a label, two that are cancelled, and
+    /// orders of other kinds. The exit code is 0 if nothing failed.
+    #[command(
+        after_help = "Example:\n  taskbench orders --postgres postgres://postgres@localhost/bench"
+    )]
+    Orders(OrdersFlags),
+
     /// Look at the page in a browser while a fleet reports, and scroll
     ///
     /// Needs node, Chromium and the packages of `scripts/need page`. First rows are timed from asking
@@ -143,6 +154,7 @@ async fn run(command: Command) -> anyhow::Result<ExitCode> {
         Command::Pull(flags) => exit_code(until_interrupted(pull::run(flags)).await?),
         Command::Broker(flags) => exit_code(until_interrupted(broker::run(flags)).await?),
         Command::Status(flags) => exit_code(until_interrupted(status::run(flags)).await?),
+        Command::Orders(flags) => exit_code(until_interrupted(orders::run(flags)).await?),
         Command::Page(flags) => exit_code(until_interrupted(page::run(flags)).await?),
         Command::Compare(flags) => {
             print(&compare(&flags)?)?;

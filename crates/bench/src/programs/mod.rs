@@ -1,6 +1,7 @@
 //! Owns the programs under measurement, taskd and those it is compared with, and the input that
 //! they get; it never measures.
 
+pub mod database;
 pub mod encryption;
 pub(crate) mod enrollment;
 pub mod package;

@@ -6,8 +6,8 @@ use std::time::Duration;
 use reqwest::{Method, RequestBuilder, Response, StatusCode, Url};
 use serde::de::DeserializeOwned;
 use task_proto::api::{
-    CreateDeployment, CreateEnrollmentToken, DeploymentView, EnrollRequest, EnrollResponse,
-    EnrollmentToken, ErrorBody, IDEMPOTENCY_KEY, RobotList, RobotView, ServerInfo,
+    CreateDeployment, CreateEnrollmentToken, DeploymentList, DeploymentView, EnrollRequest,
+    EnrollResponse, EnrollmentToken, ErrorBody, IDEMPOTENCY_KEY, RobotList, RobotView, ServerInfo,
 };
 use task_proto::desired::BlobRef;
 use task_proto::ids::selector::Selector;
@@ -115,6 +115,34 @@ impl Server {
             .request(Method::POST, "/api/v1/deployments")
             .header(IDEMPOTENCY_KEY, order.manifest.hex());
         read("the order", post.json(order)).await
+    }
+
+    /// The deployment that was ordered last, without its robots.
+    pub async fn newest_deployment(&self) -> Result<DeploymentView, ServerError> {
+        let what = "the newest deployment";
+        let get = self.request(Method::GET, "/api/v1/deployments").query(&[("limit", "1")]);
+        let mut list: DeploymentList = read(what, get).await?;
+        list.deployments
+            .pop()
+            .ok_or_else(|| ServerError::Refused(what, StatusCode::OK, "there is none".to_owned()))
+    }
+
+    /// Cancels a deployment.
+    pub async fn cancel(&self, id: &DeploymentId) -> Result<(), ServerError> {
+        let path = format!("/api/v1/deployments/{id}/cancel");
+        self.order_at("the cancel", &path, &serde_json::json!({})).await
+    }
+
+    /// Gives an order of another kind, whose answer is not read.
+    pub async fn order_at(
+        &self,
+        what: &'static str,
+        path: &str,
+        order: &serde_json::Value,
+    ) -> Result<(), ServerError> {
+        let key = format!("{:032x}", rand::random::<u128>());
+        let post = self.request(Method::POST, path).header(IDEMPOTENCY_KEY, key).json(order);
+        send(what, post).await.map(drop)
     }
 
     /// The state of a deployment, robot by robot.

@@ -4,6 +4,7 @@ pub mod blob;
 pub mod broker;
 pub mod fleet;
 pub mod load;
+pub mod orders;
 pub mod page;
 pub mod paper;
 pub mod pull;

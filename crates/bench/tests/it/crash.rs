@@ -5,8 +5,9 @@ use std::io::Write as _;
 
 use rand::RngExt as _;
 use rand::SeedableRng as _;
-use task_proto::api::RobotView;
+use task_proto::api::{DeploymentState, RobotView};
 use task_proto::messages::report::Phase;
+use taskbench::programs::database::{add_robots, sqlite_url};
 
 use crate::harness::{Fleet, Robot, Server, eventually, open_directory, write_package};
 use crate::proxy::Proxy;
@@ -78,6 +79,30 @@ async fn running_task_survives_its_agent() {
     let after = fleet.server.wait_phase("robot-1", "second", Phase::Running).await;
     assert_eq!(pid_of(&after, "steady"), Some(pid));
     assert!(std::path::Path::new(&format!("/proc/{pid}")).exists());
+}
+
+/// Most of the robots are only rows: the order takes three writes.
+#[tokio::test(flavor = "multi_thread")]
+async fn large_order_goes_on_after_a_server_crash() {
+    const ROBOTS: u64 = 5_000;
+    let dir = tempfile::tempdir().expect("temp dir");
+    let mut server = Server::start(&dir.path().join("server")).await;
+    let database = sqlite_url(&server.data().join("taskd.sqlite"));
+    add_robots(&database, ROBOTS as u32).await.expect("added");
+    let package = dir.path().join("steady");
+    write_package(&package, "steady", "1.0.0", "service", "exec sleep 1000\n");
+    let ordered = server.push(&package, "*").await;
+    server.kill();
+    let placing = ordered.placing.expect("the answer comes before the order is placed everywhere");
+    assert!(placing.selected == ROBOTS && placing.placed < ROBOTS, "{placing:?}");
+    server.restart().await;
+    let placed = eventually("the order to be placed for all robots", async || {
+        let view = server.deployment(ordered.id.as_str()).await?;
+        view.placing.is_none().then_some(view)
+    })
+    .await;
+    assert_eq!(placed.assignments.expect("there").len() as u64, ROBOTS);
+    assert_eq!(placed.state, DeploymentState::Active);
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -1,5 +1,5 @@
-//! Selectors and scopes as the database evaluates them, compared with the matcher of the wire types,
-//! on every database.
+//! Selectors and scopes as the database evaluates them, compared with the matcher of the wire
+//! types, on every database.
 
 use std::cell::RefCell;
 use std::collections::BTreeSet;

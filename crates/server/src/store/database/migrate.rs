@@ -1,6 +1,6 @@
 //! The tables, as a list of migrations that only grows: a shipped migration is never edited. Each
-//! is one SQL text for both databases, so it only uses TEXT and BIGINT columns; the one way in which
-//! they read JSON is translated. Each noun's tables have their own file.
+//! is one SQL text for both databases, so it only uses TEXT and BIGINT columns; the one way in
+//! which they read JSON is translated. Each noun's tables have their own file.
 
 use std::borrow::Cow;
 

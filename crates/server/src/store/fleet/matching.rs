@@ -1,6 +1,6 @@
-//! The robots that match a selector or belong to a scope, and the names in a selector that belong to
-//! none. The database finds them by its indexes of names and labels; no robot is read that does not
-//! match.
+//! The robots that match a selector or belong to a scope, and the names in a selector that belong
+//! to none. The database finds them by its indexes of names and labels; no robot is read that does
+//! not match.
 
 use serde::{Deserialize, Serialize};
 use sqlx::any::{AnyArguments, AnyRow};
@@ -48,8 +48,8 @@ const SELECTED: &str = "r.id, r.name";
 const KNOWN: &str = "r.id, r.name, r.mac, r.labels";
 
 impl Robots<&Store> {
-    /// The robots that match `selector` now, without those that wait for approval. With `task`, only
-    /// robots that should have the task.
+    /// The robots that match `selector` now, without those that wait for approval. With `task`,
+    /// only robots that should have the task.
     pub async fn matching(
         self,
         selector: &Selector,
@@ -100,8 +100,8 @@ impl Robots<&Store> {
 }
 
 impl Robots<&mut Transaction> {
-    /// The robots that match `selector` now, without those that wait for approval. With `task`, only
-    /// robots that should have the task.
+    /// The robots that match `selector` now, without those that wait for approval. With `task`,
+    /// only robots that should have the task.
     pub async fn matching(
         &mut self,
         selector: &Selector,

@@ -36,8 +36,8 @@ pub struct ReleasedBatch {
 }
 
 impl Assignments<&mut Transaction> {
-    /// Gives each of `robots` that is still registered its part of a deployment, in this order, from
-    /// `first_place` on. Nothing is released yet.
+    /// Gives each of `robots` that is still registered its part of a deployment, in this order,
+    /// from `first_place` on. Nothing is released yet.
     pub async fn insert(
         &mut self,
         deployment: &DeploymentId,
@@ -161,8 +161,8 @@ impl Assignments<&mut Transaction> {
         Ok(())
     }
 
-    /// Settles a new deployment on the robots from `first_place` on that run its package already, as
-    /// of their last report: nothing begins there. Their desired state stays the earlier
+    /// Settles a new deployment on the robots from `first_place` on that run its package already,
+    /// as of their last report: nothing begins there. Their desired state stays the earlier
     /// deployment, so that they receive nothing new.
     pub async fn settle_running(
         &mut self,

@@ -1,6 +1,6 @@
 //! The rest of large orders: selected robots that have no assignment yet, in chunks. A chunk leaves
-//! this table in the write that places it. Like a robot that waits for its batch, a robot here loses
-//! its part to a newer order for the task.
+//! this table in the write that places it. Like a robot that waits for its batch, a robot here
+//! loses its part to a newer order for the task.
 
 use std::collections::{BTreeSet, HashSet};
 

@@ -45,7 +45,8 @@ pub struct NewDeployment<'a> {
 #[derive(Debug)]
 pub struct OpenRollout {
     pub rollout: Rollout,
-    /// The number of robots on which the deployment has failed; 0 if the order tolerates any number.
+    /// The number of robots on which the deployment has failed; 0 if the order tolerates any
+    /// number.
     pub failed: u64,
     /// The unsettled robots, in the order of their turns. Without batches and a limit of failures,
     /// only the robots that wait.

@@ -23,9 +23,9 @@ pub struct StillRunning {
 }
 
 impl Assignments<&mut Transaction> {
-    /// Settles a new deployment of `task` on the robots from `first_place` on that, as of their last
-    /// reports, still run its package after a later one failed. Returns these robots: their desired
-    /// state is new.
+    /// Settles a new deployment of `task` on the robots from `first_place` on that, as of their
+    /// last reports, still run its package after a later one failed. Returns these robots: their
+    /// desired state is new.
     pub async fn settle_still_running(
         &mut self,
         deployment: &DeploymentId,

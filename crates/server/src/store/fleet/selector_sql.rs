@@ -47,7 +47,9 @@ impl RobotSets {
             // Every parameter must be in the text, since Postgres caches both. So the included
             // terms make theirs only if the excluded ones leave a robot.
             excludes => match self.terms(excludes) {
-                None => return Some("SELECT r.id AS robot_id FROM robots r WHERE 1 = 0".to_owned()),
+                None => {
+                    return Some("SELECT r.id AS robot_id FROM robots r WHERE 1 = 0".to_owned());
+                }
                 excluded => excluded,
             },
         };

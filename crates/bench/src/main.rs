@@ -11,6 +11,7 @@ use taskbench::results::report;
 use taskbench::results::run::Run;
 use taskbench::scenario::blob::{self, BlobFlags};
 use taskbench::scenario::broker::{self, BrokerFlags};
+use taskbench::scenario::cluster::{self, ClusterFlags};
 use taskbench::scenario::fleet::{self, FleetFlags};
 use taskbench::scenario::load::{Load, LoadFlags};
 use taskbench::scenario::orders::{self, OrdersFlags};
@@ -68,6 +69,17 @@ enum Command {
     #[command(after_help = "Examples:\n  taskbench fleet --robots 10,100,1000,10000\n  \
                             taskbench fleet --robots 500 --delivery direct-push --payload 1000000")]
     Fleet(FleetFlags),
+
+    /// Several servers on one Postgres, under load and faults, and whether anything is lost
+    ///
+    /// Starts Postgres, the servers, HAProxy where it is installed, and robots that log every
+    /// acknowledged report. After each run the database is compared with the logs. The exit code is
+    /// 0 if no invariant was broken and nothing else failed. Needs PostgreSQL; as root or where user
+    /// namespaces are allowed.
+    #[command(after_help = "Examples:\n  taskbench cluster --robots 300 --faults F0,F1,F9\n  \
+                      taskbench cluster --robots 10000 --seconds 120 --repetitions 5 --cost \\\n    \
+                      --faults F0,F1,F2,F3,F4,F6,F7,F8,F9,F10")]
+    Cluster(ClusterFlags),
 
     /// The process of a scenario's robots; it is started by the scenario
     #[command(hide = true)]
@@ -149,6 +161,7 @@ async fn run(command: Command) -> anyhow::Result<ExitCode> {
         Command::Load(flags) => load(flags).await,
         Command::Paper(flags) => exit_code(until_interrupted(paper::run(flags)).await?),
         Command::Fleet(flags) => exit_code(until_interrupted(fleet::run(flags)).await?),
+        Command::Cluster(flags) => exit_code(until_interrupted(cluster::run(flags)).await?),
         Command::Robots => taskbench::simulated::robots::run().await.map(|()| ExitCode::SUCCESS),
         Command::Blob(flags) => exit_code(until_interrupted(blob::run(flags)).await?),
         Command::Pull(flags) => exit_code(until_interrupted(pull::run(flags)).await?),

@@ -4,7 +4,7 @@
 use rand::rngs::SmallRng;
 use rand::{Rng as _, SeedableRng as _};
 use task_proto::desired::BlobRef;
-use task_proto::packages::manifest::{ContentFacts, Run, TaskManifest};
+use task_proto::packages::manifest::{ContentFacts, Run, TaskKind, TaskManifest};
 use task_proto::{Digest, TaskName, Version};
 
 /// The file in a package that has the wanted size.
@@ -23,10 +23,21 @@ pub struct Package {
 impl Package {
     /// A package with one file of `bytes` bytes, generated from `seed`. Slow for large sizes.
     pub fn random(name: TaskName, version: Version, bytes: u64, seed: u64) -> Self {
+        Self::of_kind(TaskKind::Service, name, version, bytes, seed)
+    }
+
+    /// The same for a task of this kind.
+    pub fn of_kind(
+        kind: TaskKind,
+        name: TaskName,
+        version: Version,
+        bytes: u64,
+        seed: u64,
+    ) -> Self {
         let mut payload = vec![0; usize::try_from(bytes).unwrap_or(usize::MAX)];
         SmallRng::seed_from_u64(seed).fill_bytes(&mut payload);
         let (content, facts) = content(&payload);
-        let run = Run { exec: Some(vec!["true".to_owned()]), ..Run::default() };
+        let run = Run { exec: Some(vec!["true".to_owned()]), kind, ..Run::default() };
         let manifest = TaskManifest {
             name: name.clone(),
             version: version.clone(),

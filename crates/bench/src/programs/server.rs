@@ -8,12 +8,14 @@ use serde::de::DeserializeOwned;
 use task_proto::api::{
     CreateDeployment, CreateEnrollmentToken, DeploymentList, DeploymentView, EnrollRequest,
     EnrollResponse, EnrollmentToken, ErrorBody, IDEMPOTENCY_KEY, RobotList, RobotView, ServerInfo,
+    SessionList,
 };
 use task_proto::desired::BlobRef;
 use task_proto::ids::selector::Selector;
+use task_proto::messages::request::Ask;
 use task_proto::packages::oci::{ImageManifest, MANIFEST_TYPE};
 use task_proto::trust::token::Token;
-use task_proto::{CaPin, DeploymentId, Digest, RobotId, TaskName, Version};
+use task_proto::{CaPin, DeploymentId, Digest, RobotId, RobotName, TaskName, Version};
 use tokio::sync::Mutex;
 
 use crate::programs::encryption::client_config;
@@ -21,6 +23,8 @@ use crate::programs::package::Package;
 
 /// Time limit of one answer.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(60);
+/// Time limit of a stream of events.
+const STREAM_TIMEOUT: Duration = Duration::from_secs(24 * 3600);
 /// Pause before a robot repeats a refused enrollment.
 const AGAIN: Duration = Duration::from_secs(1);
 /// The payload of a package that only has to exist.
@@ -111,9 +115,16 @@ impl Server {
 
     /// Orders a package for robots.
     pub async fn order(&self, order: &CreateDeployment) -> Result<DeploymentView, ServerError> {
-        let post = self
-            .request(Method::POST, "/api/v1/deployments")
-            .header(IDEMPOTENCY_KEY, order.manifest.hex());
+        self.order_with_key(order, &order.manifest.hex()).await
+    }
+
+    /// The same with this idempotency key.
+    pub async fn order_with_key(
+        &self,
+        order: &CreateDeployment,
+        key: &str,
+    ) -> Result<DeploymentView, ServerError> {
+        let post = self.request(Method::POST, "/api/v1/deployments").header(IDEMPOTENCY_KEY, key);
         read("the order", post.json(order)).await
     }
 
@@ -143,6 +154,32 @@ impl Server {
         let key = format!("{:032x}", rand::random::<u128>());
         let post = self.request(Method::POST, path).header(IDEMPOTENCY_KEY, key).json(order);
         send(what, post).await.map(drop)
+    }
+
+    /// Asks a robot something, and waits for its answer.
+    pub async fn ask(&self, robot: &str, question: &Ask) -> Result<(), ServerError> {
+        let post = self.request(Method::POST, &format!("/api/v1/robots/{robot}/ask"));
+        send("a question to a robot", post.json(question)).await.map(drop)
+    }
+
+    /// The server's stream of events, which goes on until one side ends it.
+    pub async fn events(&self) -> Result<Response, ServerError> {
+        let get = self.request(Method::GET, "/api/v1/events").timeout(STREAM_TIMEOUT);
+        send("the events", get).await
+    }
+
+    /// A page of the robots' sessions.
+    pub async fn sessions(&self, after: Option<&RobotName>) -> Result<SessionList, ServerError> {
+        let mut get = self.request(Method::GET, "/api/v1/server/sessions?limit=1000");
+        if let Some(after) = after {
+            get = get.query(&[("after", after.as_str())]);
+        }
+        read("the list of sessions", get).await
+    }
+
+    /// Whether the server says that it is ready.
+    pub async fn is_ready(&self) -> bool {
+        send("its readiness", self.request(Method::GET, "/readyz")).await.is_ok()
     }
 
     /// The state of a deployment, robot by robot.

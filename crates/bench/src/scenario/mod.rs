@@ -2,6 +2,7 @@
 
 pub mod blob;
 pub mod broker;
+pub mod cluster;
 pub mod fleet;
 pub mod load;
 pub mod orders;

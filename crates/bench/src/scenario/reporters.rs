@@ -1,6 +1,7 @@
 //! Robots that are connected over MQTT, have one order, and report on that order at fixed times:
 //! their reports are measured, or only keep a fleet busy.
 
+use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, bail};
@@ -14,6 +15,7 @@ use tokio::io::AsyncWriteExt as _;
 
 use crate::measure::mqtt::{Link, Login, Packet, message};
 use crate::programs::enrollment::enroll_robots;
+use crate::programs::server::Server;
 use crate::programs::taskd::Taskd;
 
 /// Connections opened at a time.
@@ -35,21 +37,32 @@ pub struct Reporter {
 
 /// Registers `count` robots, orders a package for them and connects them.
 pub async fn connect(taskd: &Taskd, count: usize) -> anyhow::Result<Vec<Reporter>> {
-    let robots = enroll_robots(&taskd.server, count).await?;
+    connect_to(&taskd.server, &[taskd.mqtt], count).await
+}
+
+/// The same at several servers, which get equal shares of the robots.
+pub async fn connect_to(
+    server: &Server,
+    addresses: &[SocketAddr],
+    count: usize,
+) -> anyhow::Result<Vec<Reporter>> {
+    let robots = enroll_robots(server, count).await?;
     let package = "status".parse()?;
     let version = "1".parse()?;
-    let manifest = taskd.server.push_package(&package, &version).await?;
+    let manifest = server.push_package(&package, &version).await?;
     let order = CreateDeployment {
         delivery: DeliveryChoice::Poll,
         ..CreateDeployment::new(package, manifest, "*".parse()?)
     };
-    let deployment = taskd.server.order(&order).await?.id;
+    let deployment = server.order(&order).await?.id;
     let connecting = robots.iter().enumerate().map(|(number, robot)| {
         let deployment = &deployment;
+        let address = addresses.get(number % addresses.len().max(1));
         async move {
+            let address = *address.context("no address of a server")?;
             let credentials = Some((robot.robot_id.as_str(), robot.token.as_str()));
             let login = Login { client_id: robot.robot_id.as_str(), credentials };
-            let link = Link::connect(taskd.mqtt, number, &login).await?;
+            let link = Link::connect(address, number, &login).await?;
             let topic =
                 robot.mqtt.prefix.format(&Topic::Robot(robot.robot_id.clone(), RobotTopic::Report));
             Ok(Reporter { link, topic, report: report(robot, deployment)? })

@@ -8,7 +8,7 @@ use anyhow::{Context as _, anyhow, bail};
 use task_proto::api::{CreateEnrollmentToken, EnrollRequest};
 use task_proto::ids::Labels;
 use task_proto::trust::token::Token;
-use task_proto::{DeploymentId, Digest, MacAddress, TaskName};
+use task_proto::{CaPin, DeploymentId, Digest, MacAddress, TaskName};
 use tempfile::TempDir;
 use tokio::io::{AsyncBufReadExt as _, AsyncWriteExt as _, BufReader};
 use tokio::process::{ChildStdin, ChildStdout};
@@ -17,8 +17,11 @@ use tokio::time::Instant;
 
 use crate::measure::phase::{PHASE_LIMIT, run_all};
 use crate::programs::package::PAYLOAD_FILE;
+use crate::programs::server::Server;
 use crate::programs::taskd::Taskd;
-use crate::simulated::robots::messages::{GroupMember, RobotCommand, RobotEvent, RobotGroup};
+use crate::simulated::robots::messages::{
+    Entrance, GroupMember, RobotCommand, RobotEvent, RobotGroup,
+};
 use crate::system::clock::monotonic_ns;
 use crate::system::link::Link;
 use crate::system::process::{Process, Program, Usage};
@@ -47,9 +50,28 @@ pub struct Fleet {
     /// `None`: a process has ended.
     events: mpsc::Receiver<Option<RobotEvent>>,
     dir: TempDir,
+    logs: Vec<PathBuf>,
     pub robots: usize,
     /// Duration of each robot's registration.
     pub enrollments: Vec<Duration>,
+}
+
+/// Where and how a fleet connects.
+pub struct FleetArgs<'a> {
+    /// The server that registers the robots.
+    pub server: &'a Server,
+    pub pin: Option<CaPin>,
+    /// Each robot has the entrance at its number, counted round.
+    pub entrances: Vec<Entrance>,
+    pub robots: usize,
+    /// Pause between two polls while a session is up.
+    pub poll: Duration,
+    /// Whether each robot connects over HTTP from a loopback address of its own.
+    pub own_addresses: bool,
+    /// The program that starts the robots' processes, if they need a namespace.
+    pub outer: Option<Program>,
+    /// Whether robots log what they do, instead of sending events.
+    pub logged: bool,
 }
 
 /// The result of an order, robot by robot.
@@ -81,24 +103,44 @@ impl Fleet {
         poll: Duration,
         link: Option<&Link>,
     ) -> anyhow::Result<Self> {
-        let (members, enrollments, key) = enroll_robots(taskd, robots).await?;
+        let entrance = Entrance { url: taskd.url(), mqtt_host: taskd.mqtt.ip().to_string() };
+        let args = FleetArgs {
+            server: &taskd.server,
+            pin: taskd.pin,
+            entrances: vec![entrance],
+            robots,
+            poll,
+            own_addresses: link.is_none(),
+            outer: link.map(Link::inside),
+            logged: false,
+        };
+        Self::assemble_with(args).await
+    }
+
+    /// Registers the robots and puts them together; they do not run yet.
+    pub async fn assemble_with(args: FleetArgs<'_>) -> anyhow::Result<Self> {
+        let robots = args.robots;
+        let (members, enrollments, key) = enroll_robots(args.server, robots).await?;
         let dir = memory_directory("taskbench-robots-")?;
         let (sender, events) = mpsc::channel(QUEUED_EVENTS);
-        let mut fleet = Self { processes: Vec::new(), events, dir, robots, enrollments };
+        let logs = Vec::new();
+        let mut fleet = Self { processes: Vec::new(), events, dir, logs, robots, enrollments };
         let mut members = members.into_iter();
         for first in (0..robots).step_by(ROBOTS_PER_PROCESS) {
+            let log = args.logged.then(|| fleet.dir.path().join(format!("from-{first}.log")));
+            fleet.logs.extend(log.clone());
             let group = RobotGroup {
-                server: taskd.url(),
-                pin: taskd.pin,
-                mqtt_host: taskd.mqtt.ip().to_string(),
+                entrances: args.entrances.clone(),
+                pin: args.pin,
                 key: key.clone(),
                 data: fleet.dir.path().to_owned(),
-                poll_ms: u64::try_from(poll.as_millis())?,
-                own_addresses: link.is_none(),
+                poll_ms: u64::try_from(args.poll.as_millis())?,
+                own_addresses: args.own_addresses,
+                log,
                 first,
                 members: members.by_ref().take(ROBOTS_PER_PROCESS).collect(),
             };
-            fleet.add(&group, link, sender.clone()).await?;
+            fleet.add(&group, args.outer.clone(), sender.clone()).await?;
         }
         let ready = async {
             for _ in 0..fleet.processes.len() {
@@ -120,12 +162,12 @@ impl Fleet {
     async fn add(
         &mut self,
         group: &RobotGroup,
-        link: Option<&Link>,
+        outer: Option<Program>,
         sender: mpsc::Sender<Option<RobotEvent>>,
     ) -> anyhow::Result<()> {
         let mut program = Program::beside("taskbench", None)?.args(["robots"]);
-        if let Some(link) = link {
-            program = program.within(link.inside());
+        if let Some(outer) = outer {
+            program = program.within(outer);
         }
         let (process, input, output) = program.converse(&self.dir.path().join(LOG))?;
         tokio::spawn(read_events(output, sender));
@@ -217,6 +259,11 @@ impl Fleet {
         Ok(Digest::of(&bytes))
     }
 
+    /// The robots' logs, one of each process; empty unless the robots were to log.
+    pub fn logs(&self) -> &[PathBuf] {
+        &self.logs
+    }
+
     /// Resource usage of all robots together until now.
     pub fn usage(&self) -> Usage {
         let each = self.processes.iter().map(|(process, _)| process.usage());
@@ -275,15 +322,14 @@ async fn read_events(output: ChildStdout, sender: mpsc::Sender<Option<RobotEvent
 
 /// Registers robots named `r0000`, `r0001`, … with addresses that no hardware has.
 async fn enroll_robots(
-    taskd: &Taskd,
+    server: &Server,
     robots: usize,
 ) -> anyhow::Result<(Vec<GroupMember>, Vec<Duration>, task_proto::trust::envelope::PublicKey)> {
     let order = CreateEnrollmentToken { uses: Some(robots as u64), ..Default::default() };
-    let token = taskd.server.create_enrollment_token(&order).await?.token;
+    let token = server.create_enrollment_token(&order).await?.token;
     let key =
         token.parse::<Token>()?.server_key().context("the enrollment token pins no key")?.clone();
     let steps = (0..robots).map(|number| {
-        let server = &taskd.server;
         let token = &token;
         async move {
             let begun = std::time::Instant::now();

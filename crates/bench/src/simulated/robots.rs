@@ -4,6 +4,7 @@
 //! ends when its input ends.
 
 mod effects;
+pub mod log;
 pub mod messages;
 
 use std::collections::BTreeSet;
@@ -37,6 +38,7 @@ use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
 use self::effects::SimulatedEffects;
+use self::log::{RobotLog, log_link};
 use self::messages::{GroupMember, RobotCommand, RobotEvent, RobotGroup, own_address};
 use crate::programs::encryption::{client_config, without_shared_sessions};
 use crate::simulated::vitals::{Machine, VITALS_INTERVAL};
@@ -55,6 +57,7 @@ struct Assembled {
     link_state: LinkState,
     access: MqttAccess,
     server: server::Server,
+    log: Option<RobotLog>,
 }
 
 /// Runs the robots that the first line of the input describes, until the input ends.
@@ -65,10 +68,12 @@ pub async fn run() -> anyhow::Result<()> {
         serde_json::from_str(&first).context("the first line is not a robot group")?;
     let (events, queued) = mpsc::channel(QUEUED_EVENTS);
     std::thread::spawn(move || write_events(queued));
+    let log = group.log.as_deref().map(RobotLog::open).transpose()?;
     let tls = client_config(group.pin);
     let mut robots = Vec::with_capacity(group.members.len());
     for (number, member) in (group.first..).zip(&group.members) {
-        let robot = assemble(&group, without_shared_sessions(&tls), number, member)
+        let log = log.clone().map(|lines| RobotLog::of(number, lines));
+        let robot = assemble(&group, without_shared_sessions(&tls), number, member, log)
             .await
             .with_context(|| format!("robot {number}"))?;
         robots.push((number, robot));
@@ -116,11 +121,14 @@ async fn assemble(
     tls: ClientConfig,
     number: usize,
     member: &GroupMember,
+    log: Option<RobotLog>,
 ) -> anyhow::Result<Assembled> {
+    let entrance = group.entrances.get(number % group.entrances.len().max(1));
+    let entrance = entrance.context("the robot group has no entrance")?;
     let data = DataDir::new(&group.data.join(number.to_string()))?;
     std::fs::create_dir_all(data.root()).with_context(|| data.root().display().to_string())?;
     let config = Config::load(data.root(), std::iter::empty::<(OsString, OsString)>())?;
-    let base = parse_server(&group.server)?;
+    let base = parse_server(&entrance.url)?;
     let client = http_client(tls.clone(), group.own_addresses.then(|| own_address(number).into()))?;
     let enrolled = &member.enrolled;
     let credential = Credential::from(enrolled.token.clone());
@@ -153,7 +161,7 @@ async fn assemble(
     let status =
         Status { online: true, start: ledger.start + 1, instance, connection: 0, place: None };
     let driver = Driver::new(
-        Arc::new(SimulatedEffects::new(robot, facts)),
+        Arc::new(SimulatedEffects::new(robot, facts, log.clone())),
         agent_identity,
         link_state.clone(),
         ledger,
@@ -164,7 +172,7 @@ async fn assemble(
         server::Server::new(client, base.clone(), enrolled.robot_id.clone(), credential.clone());
     link_state.endpoint.send_replace(Some(enrolled.mqtt.clone()));
     let access = MqttAccess {
-        host: group.mqtt_host.clone(),
+        host: entrance.mqtt_host.clone(),
         port: enrolled.mqtt.port,
         prefix: enrolled.mqtt.prefix.clone(),
         robot: enrolled.robot_id.clone(),
@@ -173,7 +181,7 @@ async fn assemble(
         message_bytes: mqtt::MESSAGE_BYTES,
         routes: Routes::new(&base, Arc::new(tls), MqttTransport::Tcp),
     };
-    Ok(Assembled { driver, link_state, access, server })
+    Ok(Assembled { driver, link_state, access, server, log })
 }
 
 /// As the agent's, from an address of its own.
@@ -189,7 +197,7 @@ fn http_client(tls: ClientConfig, from: Option<IpAddr>) -> anyhow::Result<reqwes
 }
 
 fn start(number: usize, robot: Assembled, group: &RobotGroup, events: mpsc::Sender<RobotEvent>) {
-    let Assembled { driver, link_state, access, server } = robot;
+    let Assembled { driver, link_state, access, server, log } = robot;
     let (server_messages, messages): (mpsc::Sender<ServerMessage>, _) =
         mpsc::channel(QUEUED_MESSAGES);
     let poll = std::time::Duration::from_millis(group.poll_ms);
@@ -208,7 +216,11 @@ fn start(number: usize, robot: Assembled, group: &RobotGroup, events: mpsc::Send
     };
     tokio::spawn(vitals.run(link_state.clone(), messages_out.clone()));
     tokio::spawn(answer(robot_id, source, received, messages_out));
-    tokio::spawn(report_events(number, link_state.clone(), events));
+    let until = if log.is_some() { Until::Reconciled } else { Until::End };
+    tokio::spawn(report_events(number, link_state.clone(), events, until));
+    if let Some(log) = log {
+        tokio::spawn(log_link(log, link_state.clone()));
+    }
     tokio::spawn(driver.run(messages));
     tokio::spawn(state::run_http(server, link_state.clone(), intervals, server_messages.clone()));
     tokio::spawn(async move {
@@ -244,8 +256,21 @@ async fn answer(
     }
 }
 
+/// How long a robot sends events.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Until {
+    /// Until it keeps to its desired state for the first time; the rest is in the log.
+    Reconciled,
+    End,
+}
+
 /// Sends an event for each event in the robot's reports, once the report is acknowledged.
-async fn report_events(robot: usize, link_state: LinkState, events: mpsc::Sender<RobotEvent>) {
+async fn report_events(
+    robot: usize,
+    link_state: LinkState,
+    events: mpsc::Sender<RobotEvent>,
+    until: Until,
+) {
     let mut reports = link_state.reports.subscribe();
     let mut confirmed = link_state.confirmed.subscribe();
     let mut mqtt = link_state.mqtt.subscribe();
@@ -270,6 +295,9 @@ async fn report_events(robot: usize, link_state: LinkState, events: mpsc::Sender
         if !reconciled && mqtt.borrow_and_update().is_up() && keeps_state {
             reconciled = true;
             let _ = events.send(RobotEvent::Reconciled { robot, at_ns }).await;
+            if until == Until::Reconciled {
+                return;
+            }
         }
         let due: Vec<_> = waiting.extract_if(.., |(seq, ..)| *seq <= stored).collect();
         for (_, deployment, why) in due {

@@ -208,6 +208,18 @@ impl Process {
         }
     }
 
+    /// Sends a signal to the process itself. Returns false once its end was noticed.
+    pub fn signal(&self, signal: Signal) -> bool {
+        let pid = self.pid().and_then(|pid| i32::try_from(pid).ok());
+        pid.is_some_and(|pid| kill(Pid::from_raw(pid), signal).is_ok())
+    }
+
+    /// Kills the process and its group at once, and waits for its end.
+    pub async fn kill(mut self) {
+        self.kill_group();
+        let _ = self.child.kill().await;
+    }
+
     /// Sends SIGTERM, and kills the process after a timeout.
     pub async fn end(mut self) {
         let pid = self.child.id().and_then(|pid| i32::try_from(pid).ok());

@@ -7,6 +7,7 @@ mod client_ids;
 mod cluster;
 mod cluster_forward;
 mod cluster_nodes;
+mod cluster_scenario;
 mod confinement;
 mod corridor;
 mod crash;

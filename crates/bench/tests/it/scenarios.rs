@@ -9,7 +9,7 @@ use serde_json::Value;
 use crate::harness::program;
 use crate::leftovers::processes_with;
 
-async fn taskbench(dir: &Path, arguments: &[&str]) -> Output {
+pub async fn taskbench(dir: &Path, arguments: &[&str]) -> Output {
     let data = dir.join("data");
     let out = dir.join("out");
     std::fs::create_dir(&data).expect("a directory");

@@ -310,8 +310,8 @@ impl Server {
             tracing::error!("the HTTP listener had failed");
         }
         // The writer ends when no sender of reports is left: the broker's inbox and the routes were
-        // the last.
-        drop(self.broker);
+        // the last. The drain holds the broker too.
+        drop((self.broker, self.drain));
         self.tasks.close();
         let drained = async {
             self.tasks.wait().await;

@@ -4,7 +4,7 @@
 use std::io::{BufRead as _, BufReader};
 use std::os::unix::fs::PermissionsExt as _;
 use std::process::{Child, Stdio};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use nix::sys::signal::Signal;
 use reqwest::{Method, StatusCode};
@@ -38,6 +38,16 @@ async fn first_start_creates_private_files() {
     let addresses = server.data().join("addresses.json");
     let _directory = server.stop().await;
     assert!(!addresses.exists());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn idle_server_stops_without_waiting_for_reports() {
+    let server = TestServer::start().await;
+    let begun = Instant::now();
+    let _directory = server.stop().await;
+    let elapsed = begun.elapsed();
+    // The time that a stop gives to reports that are not stored yet.
+    assert!(elapsed < Duration::from_secs(3), "{elapsed:?}");
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -1,6 +1,6 @@
 //! A simulated robot's body: the agent's own effects for packages (fetch, verify, unpack, delete),
-//! and a body without processes, ROS and a ledger on the disk for the rest. Started tasks run at
-//! once and forever.
+//! and a body without processes, ROS and a ledger on the disk for the rest. Started services run at
+//! once and forever; jobs succeed at once.
 
 use std::collections::BTreeSet;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -17,9 +17,12 @@ use task_agent::task::run::{ActiveRun, ProcessRecord};
 use task_agent::transfer::parts::PartRequest;
 use task_proto::desired::{BlobRef, DesiredState, PackageRef};
 use task_proto::messages::report::{HostFacts, Progress};
+use task_proto::packages::manifest::TaskKind;
 use task_proto::{Digest, TaskName};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
+
+use super::log::{LoggedEvent, RobotLog};
 
 /// The pid of every started task.
 const PID: u32 = 1;
@@ -29,18 +32,32 @@ pub struct SimulatedEffects {
     robot: Robot,
     facts: HostFacts,
     health: watch::Sender<Health>,
-    /// The run directories, by name, of tasks that were started and not stopped.
+    /// The run directories, by name, of services that were started and not stopped.
     alive: Mutex<BTreeSet<String>>,
+    /// The run directories, by name, of jobs that were started and have succeeded.
+    succeeded: Mutex<BTreeSet<String>>,
+    log: Option<RobotLog>,
 }
 
 impl SimulatedEffects {
     /// A body around the agent's own effects, with these facts about its machine.
-    pub fn new(robot: Robot, facts: HostFacts) -> Self {
-        Self { robot, facts, health: watch::Sender::new(Health::Unknown), alive: Mutex::default() }
+    pub fn new(robot: Robot, facts: HostFacts, log: Option<RobotLog>) -> Self {
+        Self {
+            robot,
+            facts,
+            health: watch::Sender::new(Health::Unknown),
+            alive: Mutex::default(),
+            succeeded: Mutex::default(),
+            log,
+        }
     }
 
     fn alive(&self) -> MutexGuard<'_, BTreeSet<String>> {
         self.alive.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn succeeded(&self) -> MutexGuard<'_, BTreeSet<String>> {
+        self.succeeded.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -85,12 +102,16 @@ impl Effects for SimulatedEffects {
         if self.alive().contains(&process.dir) {
             return ProcessState::Alive { pid: PID };
         }
-        let status = Some(ExitStatus::Signal(15));
+        let has_succeeded = self.succeeded().contains(&process.dir);
+        let status = if has_succeeded { ExitStatus::Code(0) } else { ExitStatus::Signal(15) };
+        let status = Some(status);
         ProcessState::Ended(Exit { status, out_of_memory_bytes: None, last_lines: String::new() })
     }
 
-    async fn process_ended(&self, _: &TaskName, _: &ProcessRecord) {
-        std::future::pending().await
+    async fn process_ended(&self, _: &TaskName, process: &ProcessRecord) {
+        if !self.succeeded().contains(&process.dir) {
+            std::future::pending().await
+        }
     }
 
     fn watch(&self, _: &TaskName, _: &ActiveRun) -> watch::Receiver<Health> {
@@ -162,7 +183,15 @@ impl Effects for SimulatedEffects {
     }
 
     async fn start(&self, _: &TaskName, run: &ActiveRun) -> Result<u32, StepFailure> {
-        self.alive().extend(run.process().map(|process| process.dir.clone()));
+        let dir = run.process().map(|process| process.dir.clone());
+        match run.rules.kind {
+            TaskKind::Job => self.succeeded().extend(dir),
+            TaskKind::Service => self.alive().extend(dir),
+        }
+        if let Some(log) = &self.log {
+            let deployment = run.deployment.clone();
+            log.write(LoggedEvent::Started { deployment, run: run.run }).await;
+        }
         Ok(PID)
     }
 

@@ -13,11 +13,10 @@ use task_proto::{CaPin, DeploymentId, MacAddress};
 /// [`RobotCommand`].
 #[derive(Serialize, Deserialize)]
 pub struct RobotGroup {
-    pub server: String,
+    /// Where robots connect; each robot has the one at its number, counted round.
+    pub entrances: Vec<Entrance>,
     /// Pin of the certificate authority; absent without encryption.
     pub pin: Option<CaPin>,
-    /// The MQTT listener's host; the port is in each robot's enrollment.
-    pub mqtt_host: String,
     /// The key that its states are signed with.
     pub key: PublicKey,
     /// Directory of the robots' data.
@@ -26,9 +25,20 @@ pub struct RobotGroup {
     pub poll_ms: u64,
     /// Whether each robot connects over HTTP from an address of its own below 127.0.0.0/16.
     pub own_addresses: bool,
+    /// The file for the robots' log; absent: no log.
+    pub log: Option<PathBuf>,
     /// The number of the first robot; the others count on from there.
     pub first: usize,
     pub members: Vec<GroupMember>,
+}
+
+/// The server as robots know it.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Entrance {
+    /// The URL for HTTP.
+    pub url: String,
+    /// The MQTT listener's host; the port is in each robot's enrollment.
+    pub mqtt_host: String,
 }
 
 #[derive(Clone, Serialize, Deserialize)]

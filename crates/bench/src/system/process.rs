@@ -13,6 +13,7 @@ use std::time::Duration;
 use nix::sys::resource::{UsageWho, getrusage};
 use nix::sys::signal::{Signal, kill, killpg};
 use nix::sys::time::TimeVal;
+use nix::sys::wait::{Id, WaitPidFlag, waitid};
 use nix::unistd::Pid;
 use tokio::process::{Child, ChildStdin, ChildStdout, Command};
 
@@ -259,6 +260,12 @@ impl Process {
 impl Drop for Process {
     fn drop(&mut self) {
         self.kill_group();
+        // A directory that is removed next must not be written to any more. The exit status stays
+        // for the runtime, which reaps the process.
+        if let Some(pid) = self.pid().and_then(|pid| i32::try_from(pid).ok()) {
+            let ended = WaitPidFlag::WEXITED | WaitPidFlag::WNOWAIT;
+            let _ = waitid(Id::Pid(Pid::from_raw(pid)), ended);
+        }
     }
 }
 

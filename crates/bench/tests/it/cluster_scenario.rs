@@ -13,8 +13,9 @@ async fn cluster_loses_nothing_when_a_server_is_killed() {
     let output = taskbench(dir.path(), &[&arguments[..], &more[..]].concat()).await;
     let said = String::from_utf8_lossy(&output.stderr);
     let json = std::fs::read(dir.path().join("out/cluster.json"));
-    let run: Value = serde_json::from_slice(&json.unwrap_or_else(|error| panic!("{error}: {said}")))
-        .expect("json");
+    let run: Value =
+        serde_json::from_slice(&json.unwrap_or_else(|error| panic!("{error}: {said}")))
+            .expect("json");
     assert!(output.status.success(), "{said}");
     let points = run["points"].as_array().expect("points");
     let series: Vec<_> = points.iter().map(|point| point["series"].as_str()).collect();

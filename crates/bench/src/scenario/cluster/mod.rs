@@ -160,7 +160,7 @@ fn notes() -> Vec<String> {
         "push: from the order's first request to the robot's verified state; first_10s: orders in the ten seconds \
          after the fault began, during: later ones while it lasted. stored: from a robot's report to its \
          acknowledgement. back_after_fault: from the fault to the next session of a robot that lost its own.",
-        "A failure that begins with I1 to I9 is a broken invariant; docs/measurements.md lists them.",
+        "A failure that begins with I1 to I9 is a broken invariant; docs/measurements.md has the list.",
     ];
     notes.map(str::to_owned).to_vec()
 }

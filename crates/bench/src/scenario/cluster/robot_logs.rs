@@ -46,7 +46,7 @@ pub struct RobotLogs {
     /// Acknowledgements, those of old reports included.
     pub acknowledged: u64,
     /// The places in `gaps` of robots without a session.
-    open_gaps: BTreeMap<usize, usize>,
+    pub open_gaps: BTreeMap<usize, usize>,
 }
 
 impl RobotLogs {

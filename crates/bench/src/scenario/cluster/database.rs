@@ -5,15 +5,29 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use anyhow::{Context as _, bail};
+use anyhow::Context as _;
 use sqlx::postgres::{PgListener, PgRow};
 use sqlx::{Connection as _, PgConnection, Row as _};
 use task_proto::DeploymentId;
 
 /// Time limit of a query.
 const QUERY_TIMEOUT: Duration = Duration::from_secs(20);
+/// Pause before a query is asked again.
+const AGAIN: Duration = Duration::from_millis(100);
 /// The channel on which the servers notify each other.
 const CHANNEL: &str = "taskd";
+
+/// Why a query has no answer.
+enum AskError {
+    /// There is no primary, or the connection was lost.
+    Away,
+    Refused(sqlx::Error),
+}
+
+/// Whether the server ends the session, instead of refusing the query: class 57 of its codes.
+fn is_shutdown(error: &dyn sqlx::error::DatabaseError) -> bool {
+    error.code().is_some_and(|code| code.starts_with("57"))
+}
 
 /// A connection to the primary, opened again when it is lost.
 pub struct Database {
@@ -67,33 +81,51 @@ impl Database {
         Self { urls, connection: None }
     }
 
-    async fn connect(urls: &[String]) -> anyhow::Result<PgConnection> {
+    /// A connection to the first server that is a primary.
+    async fn connect(urls: &[String]) -> Option<PgConnection> {
         for url in urls {
             let Ok(mut connection) = PgConnection::connect(url).await else { continue };
             let asked = sqlx::query_scalar::<_, bool>("SELECT pg_is_in_recovery()");
             if matches!(asked.fetch_one(&mut connection).await, Ok(false)) {
-                return Ok(connection);
+                return Some(connection);
             }
         }
-        bail!("no database server is a primary")
+        None
     }
 
+    /// The answer to a query. It is asked again while the database is away, as in a failover.
     async fn rows(&mut self, sql: &'static str, parameter: &str) -> anyhow::Result<Vec<PgRow>> {
-        let Self { urls, connection } = self;
         let asking = async {
-            let mut open = match connection.take() {
-                Some(open) => open,
-                None => Self::connect(urls).await?,
-            };
-            let query = sqlx::query(sql);
-            let query = if parameter.is_empty() { query } else { query.bind(parameter) };
-            let rows = query.fetch_all(&mut open).await?;
-            // A connection that failed is not used again.
-            *connection = Some(open);
-            anyhow::Ok(rows)
+            loop {
+                match self.ask(sql, parameter).await {
+                    Err(AskError::Away) => tokio::time::sleep(AGAIN).await,
+                    Err(AskError::Refused(error)) => return Err(error),
+                    Ok(rows) => return Ok(rows),
+                }
+            }
         };
         let answer = tokio::time::timeout(QUERY_TIMEOUT, asking).await;
         answer.context("the database does not answer")?.context("the database")
+    }
+
+    async fn ask(&mut self, sql: &'static str, parameter: &str) -> Result<Vec<PgRow>, AskError> {
+        let mut open = match self.connection.take() {
+            Some(open) => open,
+            None => Self::connect(&self.urls).await.ok_or(AskError::Away)?,
+        };
+        let query = sqlx::query(sql);
+        let query = if parameter.is_empty() { query } else { query.bind(parameter) };
+        match query.fetch_all(&mut open).await {
+            Ok(rows) => {
+                // A connection that failed is not used again.
+                self.connection = Some(open);
+                Ok(rows)
+            }
+            Err(sqlx::Error::Database(error)) if !is_shutdown(error.as_ref()) => {
+                Err(AskError::Refused(sqlx::Error::Database(error)))
+            }
+            Err(_) => Err(AskError::Away),
+        }
     }
 
     async fn number(&mut self, sql: &'static str) -> anyhow::Result<u64> {

@@ -1,6 +1,7 @@
 //! The faults of a run: each begins at a random moment, lasts for a while and ends with all engines
 //! running again.
 
+use std::collections::BTreeMap;
 use std::time::Duration;
 
 use anyhow::{Context as _, bail, ensure};
@@ -9,7 +10,7 @@ use rand::RngExt as _;
 use rand::rngs::SmallRng;
 use tokio::time::Instant;
 
-use super::database::{Database, promote};
+use super::database::{Database, RobotRow, promote};
 use super::engines::Engines;
 use crate::system::clock::monotonic_ns;
 
@@ -83,6 +84,14 @@ pub struct FaultTimes {
     pub ended_ns: u64,
 }
 
+/// A fault that is over.
+#[derive(Debug)]
+pub struct Injected {
+    pub times: FaultTimes,
+    /// The robots' rows in the standby when it was promoted.
+    pub promoted: Option<BTreeMap<String, RobotRow>>,
+}
+
 /// Brings the fault about, holds it, and ends it.
 pub async fn inject(
     fault: Fault,
@@ -90,7 +99,8 @@ pub async fn inject(
     database: &mut Database,
     hold: Duration,
     random: &mut SmallRng,
-) -> anyhow::Result<FaultTimes> {
+) -> anyhow::Result<Injected> {
+    let mut promoted = None;
     let node = random.random_range(0..engines.nodes.len());
     let mut began_ns = monotonic_ns();
     match fault {
@@ -116,6 +126,8 @@ pub async fn inject(
             engines.primary.kill().await;
             let standby = engines.database.last().context("no standby")?;
             promote(standby).await?;
+            // Before many robots have reported again.
+            promoted = Some(database.robots().await?);
         }
         Fault::KillGateway => {
             engines.objects.kill_one().await?;
@@ -146,7 +158,7 @@ pub async fn inject(
         }
         Fault::EndListeners => end_listeners(database, hold).await?,
     }
-    Ok(FaultTimes { began_ns, ended_ns: monotonic_ns() })
+    Ok(Injected { times: FaultTimes { began_ns, ended_ns: monotonic_ns() }, promoted })
 }
 
 /// Pauses a server that holds the exclusive lock, and returns its number. The lock is looked at

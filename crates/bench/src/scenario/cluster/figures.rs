@@ -157,6 +157,17 @@ pub fn measure_reconnects(point: &mut Point, logs: &RobotLogs, times: FaultTimes
     }
 }
 
+/// Adds the longest time in which no report was stored after the fault began.
+pub fn measure_pause(point: &mut Point, logs: &RobotLogs, began_ns: u64, ended_ns: u64) {
+    let mut times: Vec<u64> = logs.stored.iter().map(|report| report.at_ns).collect();
+    times.retain(|at_ns| (began_ns..ended_ns).contains(at_ns));
+    times.extend([began_ns, ended_ns]);
+    times.sort_unstable();
+    let pauses = times.windows(2).map(|pair| pair[1] - pair[0]);
+    let longest = pauses.max().map(|longest_ns| longest_ns as f64 / 1e6);
+    point.measure("longest_pause", Unit::Milliseconds, longest);
+}
+
 /// Adds what the engines used between two moments.
 pub fn measure_resources(point: &mut Point, logs: &RobotLogs, from: &Resources, to: &Resources) {
     let used = to.minus(from);

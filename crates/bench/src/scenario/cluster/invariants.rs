@@ -41,6 +41,27 @@ pub fn lost_reports(logs: &RobotLogs, stored: &Stored) -> Vec<String> {
     found
 }
 
+/// I1 at a failover: the standby had all reports that were acknowledged before the primary was lost.
+pub fn lost_at_failover(
+    logs: &RobotLogs,
+    lost_ns: u64,
+    promoted: &BTreeMap<String, RobotRow>,
+) -> Vec<String> {
+    let mut newest: BTreeMap<usize, (u64, u64)> = BTreeMap::new();
+    for report in logs.stored.iter().filter(|report| report.at_ns < lost_ns) {
+        let position = newest.entry(report.robot).or_default();
+        *position = report.position.max(*position);
+    }
+    let lost = newest.into_iter().filter_map(|(robot, position)| {
+        let robot = name(robot);
+        let has = promoted.get(&robot).map(|row| row.position);
+        (has < Some(position)).then(|| {
+            format!("{robot}: report {position:?} was acknowledged, the standby had {has:?}")
+        })
+    });
+    lost.collect()
+}
+
 fn other_phases<'a>(
     robot: &'a str,
     last: &'a Acknowledged,
@@ -190,6 +211,7 @@ mod tests {
 
     use super::*;
     use crate::scenario::cluster::database::Progress;
+    use crate::scenario::cluster::robot_logs::StoredReport;
     use crate::simulated::robots::log::LoggedTask;
 
     fn deployment() -> DeploymentId {
@@ -236,6 +258,18 @@ mod tests {
         assert!(lost_reports(&logs, &stored)[0].contains("(1, 4) was acknowledged"));
         stored.robots.clear();
         assert!(lost_reports(&logs, &stored)[0].contains("not in the database"));
+    }
+
+    #[test]
+    fn report_that_the_standby_did_not_have_is_found() {
+        let report =
+            |seq, at_ns| StoredReport { robot: 0, position: (1, seq), at_ns, took_ms: 1.0 };
+        let logs = RobotLogs { stored: vec![report(4, 10), report(5, 20)], ..RobotLogs::default() };
+        let (_, stored) = agreeing();
+        // The newest before the loss is stored, as report 4 of start 1.
+        assert_eq!(lost_at_failover(&logs, 20, &stored.robots), Vec::<String>::new());
+        assert_eq!(lost_at_failover(&logs, 21, &stored.robots).len(), 1);
+        assert_eq!(lost_at_failover(&logs, 20, &BTreeMap::new()).len(), 1);
     }
 
     #[test]

@@ -24,7 +24,7 @@ use self::faults::Fault;
 use self::load::LoadArgs;
 use self::one_run::{RunArgs, run_once};
 use crate::programs::taskd::TaskdFlags;
-use crate::results::run::{Figure, Plot, Run, RunFlags};
+use crate::results::run::{Figure, Plot, Point, Run, RunFlags};
 use crate::simulated::fleet::{FILES_PER_ROBOT, ROBOTS_PER_PROCESS};
 use crate::system::machine::allow_files;
 use crate::system::progress::{RunProgress, print_line};
@@ -129,13 +129,25 @@ pub async fn run(flags: ClusterFlags) -> anyhow::Result<Run> {
                 },
                 length: Duration::from_secs(flags.seconds),
             };
-            let ran = run_once(&args).await;
-            let (point, version) = ran.with_context(|| fault.label().to_owned())?;
+            let point = match run_once(&args).await {
+                Ok((point, version)) => {
+                    run.versions.insert("taskd".to_owned(), version);
+                    point
+                }
+                // A run that can't be completed costs the campaign no other run.
+                Err(error) => {
+                    let settings = [("nodes", f64::from(flags.nodes)), ("robots", robots as f64)];
+                    let mut point = Point::new(fault.label(), settings);
+                    point.fail(format!("the run ended early: {error:#}"));
+                    point
+                }
+            };
             for (why, count) in &point.failures {
                 print_line(&format!("{}, seed {seed}: {count} × {why}", fault.label()));
             }
-            run.versions.insert("taskd".to_owned(), version);
             run.points.push(point);
+            // What a longer campaign has so far outlives its end.
+            run.write(&flags.run.out, begun).context("the results can't be written")?;
             progress.step();
         }
     }

@@ -14,8 +14,10 @@ use tokio_util::task::AbortOnDropHandle;
 
 use super::database::{Counters, Database, count_notifications};
 use super::engines::{EngineArgs, Engines};
-use super::faults::{Fault, FaultTimes, inject};
-use super::figures::{Resources, measure_latencies, measure_reconnects, measure_resources};
+use super::faults::{Fault, Injected, inject};
+use super::figures::{
+    Resources, measure_latencies, measure_pause, measure_reconnects, measure_resources,
+};
 use super::invariants::{self, Stored};
 use super::load::{Load, LoadArgs, Record};
 use super::robot_logs::RobotLogs;
@@ -47,7 +49,7 @@ pub struct RunArgs<'a> {
 struct Evidence {
     record: Record,
     double: std::collections::BTreeSet<String>,
-    times: FaultTimes,
+    fault: Injected,
     from: Resources,
     to: Resources,
 }
@@ -75,8 +77,10 @@ pub async fn run_once(args: &RunArgs<'_>) -> anyhow::Result<(Point, String)> {
     settled.err().into_iter().for_each(|error| point.fail(format!("{error:#}")));
     // The logs first: what they have acknowledged must be in the database.
     let logs = RobotLogs::read(fleet.logs())?;
-    measure_latencies(&mut point, &logs, &evidence.record, evidence.times);
-    measure_reconnects(&mut point, &logs, evidence.times);
+    let times = evidence.fault.times;
+    measure_latencies(&mut point, &logs, &evidence.record, times);
+    measure_reconnects(&mut point, &logs, times);
+    measure_pause(&mut point, &logs, times.began_ns, evidence.to.at_ns);
     measure_resources(&mut point, &logs, &evidence.from, &evidence.to);
     check(&mut point, &logs, &evidence, &engines, &mut database).await?;
     for node in &mut engines.nodes {
@@ -115,15 +119,14 @@ async fn put_under_load(
     let begun = Instant::now();
     tokio::time::sleep(args.length.mul_f64(random.random_range(BEGINS))).await;
     let hold = args.length.mul_f64(LASTS).min(LONGEST_FAULT);
-    let times = inject(args.fault, engines, database, hold, &mut random).await;
-    let times = times.with_context(|| args.fault.label().to_owned())?;
+    let fault = inject(args.fault, engines, database, hold, &mut random).await?;
     tokio::time::sleep_until(begun + args.length).await;
 
     let to = Resources::now(engines, database.counters().await?, counted());
     let record = load.end().await?;
     stop.cancel();
     let double = watching.await.context("the watch of sessions")?;
-    Ok(Evidence { record, double, times, from, to })
+    Ok(Evidence { record, double, fault, from, to })
 }
 
 /// Waits until no robot is behind, no assignment is open, and all stored reports are acknowledged.
@@ -172,8 +175,12 @@ async fn check(
     let feed = database.feed().await?;
     let doubled = double.iter().map(|robot| format!("{robot} kept sessions at two servers"));
     let robots = stored.robots.len();
+    let mut lost = invariants::lost_reports(logs, &stored);
+    if let Injected { times, promoted: Some(robots) } = &evidence.fault {
+        lost.extend(invariants::lost_at_failover(logs, times.began_ns, robots));
+    }
     let found = [
-        ("I1", invariants::lost_reports(logs, &stored)),
+        ("I1", lost),
         ("I2", invariants::other_generations(logs, &stored, robots)),
         ("I3", invariants::repeated_runs(logs)),
         ("I4", invariants::exceeded_limits(&record.samples)),

@@ -19,6 +19,8 @@ pub struct Acknowledged {
 /// A report that was acknowledged.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StoredReport {
+    pub robot: usize,
+    pub position: (u64, u64),
     pub at_ns: u64,
     pub took_ms: f64,
 }
@@ -91,8 +93,10 @@ impl RobotLogs {
             LoggedEvent::Acknowledged { start, seq, generation, took_ns, tasks } => {
                 self.acknowledged += 1;
                 if let Some(took_ns) = took_ns {
-                    self.stored.push(StoredReport { at_ns, took_ms: took_ns as f64 / 1e6 });
-                    let last = Acknowledged { position: (start, seq), generation, tasks };
+                    let position = (start, seq);
+                    let took_ms = took_ns as f64 / 1e6;
+                    self.stored.push(StoredReport { robot, position, at_ns, took_ms });
+                    let last = Acknowledged { position, generation, tasks };
                     self.last.insert(robot, last);
                 }
             }
@@ -119,7 +123,10 @@ mod tests {
         let gap = |robot, from_ns, until_ns| Gap { robot, from_ns, until_ns };
         assert_eq!(logs.gaps, [gap(1, 7, Some(9)), gap(2, 8, None)]);
         assert_eq!(logs.last[&1].position, (1, 4));
-        assert_eq!(logs.stored, [StoredReport { at_ns: 9, took_ms: 3.0 }]);
+        assert_eq!(
+            logs.stored,
+            [StoredReport { robot: 1, position: (1, 4), at_ns: 9, took_ms: 3.0 }]
+        );
         assert!(logs.add("{}\n").is_err());
     }
 }

@@ -14,7 +14,7 @@ const ALLOWED: Duration = Duration::from_secs(2);
 /// Shortest pause between two looks.
 const MIN_INTERVAL: Duration = Duration::from_millis(500);
 /// Robots that are listed in a second of pause: a look at a large fleet is work for the servers.
-const ROBOTS_PER_SECOND: u64 = 2000;
+const ROBOTS_PER_SECOND: u64 = 1000;
 /// Time limit of a page: a paused server has no sessions that matter.
 const PAGE_TIMEOUT: Duration = Duration::from_secs(3);
 

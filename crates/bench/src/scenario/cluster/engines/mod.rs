@@ -29,6 +29,8 @@ use crate::system::process::Program;
 const BALANCERS: usize = 3;
 /// As the agent's own default.
 const POLL: std::time::Duration = std::time::Duration::from_secs(300);
+/// After this time the collector takes what no package needs, also while packages are pushed.
+const BLOB_GRACE: &str = "20s";
 /// Limits that a fleet at one address would meet, unlike a real one.
 const NO_LIMIT: &str = "1000000";
 
@@ -159,6 +161,7 @@ impl Engines {
             ("TASKD_CLUSTER_BUS", if args.bus { "postgres" } else { "off" }.to_owned()),
             ("TASKD_PROXIES", proxies.collect::<Vec<_>>().join(",")),
             ("TASKD_PUBLIC_MQTT_PORT", mqtt.port().to_string()),
+            ("TASKD_BLOB_GRACE", BLOB_GRACE.to_owned()),
             ("TASKD_ENROLMENT_PER_MINUTE", NO_LIMIT.to_owned()),
             ("TASKD_MAX_SILENT_PER_ADDRESS", NO_LIMIT.to_owned()),
         ];

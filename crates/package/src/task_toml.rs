@@ -78,6 +78,7 @@ impl Section<'_> {
             section.take("launch", &mut run.launch);
             section.take("exec", &mut run.exec);
             section.take("args", &mut run.args);
+            section.take("env", &mut run.env);
             section.take("kind", &mut run.kind);
             section.take("on_boot", &mut run.on_boot);
             section.take("restart", &mut run.restart);
@@ -288,6 +289,7 @@ mod tests {
             [run]
             launch = ["corridor_mapping", "mapping.launch.py"]
             args = { use_sim_time = "false" }
+            env = { GREETING = "good day" }
             kind = "job"
             on_boot = "hold"
             restart = "never"
@@ -322,6 +324,7 @@ mod tests {
             (file.run.kind, file.run.on_boot, file.run.restart),
             (TaskKind::Job, OnBoot::Hold, Restart::Never)
         );
+        assert_eq!(file.run.env["GREETING"], "good day");
         assert_eq!((file.run.stop_timeout_s, file.ready.hold_s, file.ready.timeout_s), (3, 1, 20));
         assert_eq!(file.parameters["/mapper"]["resolution"], serde_json::json!(0.05));
         assert_eq!(file.parameters["/mapper"]["frames"], serde_json::json!(["map", "odom"]));

@@ -137,6 +137,7 @@ mod tests {
             tasks: vec![task("a"), task("b")],
             evidence: Default::default(),
             settings: Default::default(),
+            robot: Default::default(),
         }
     }
 

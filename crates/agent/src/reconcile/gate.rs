@@ -9,13 +9,14 @@ use std::io::{self, PipeReader, Read as _};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use task_proto::TaskName;
 use task_proto::error_chain::chain;
 use task_proto::messages::report::{Failure, FailureCode};
-use task_proto::{RobotId, TaskName};
 
 use crate::config::{GateConfig, GateDefault};
 use crate::process::containment::{Containment, ContainmentError, KillOnDrop, RUN_DIR_VARIABLE};
 use crate::process::program::{self, ExitStatus};
+use crate::setup::environment::task_variables;
 use crate::task::ledger::{GateQuestion, GateStep};
 
 /// The maximum bytes of the gate's output that are read as its reason.
@@ -31,7 +32,6 @@ const DRAIN_TIMEOUT: Duration = Duration::from_secs(2);
 #[derive(Debug, Clone)]
 pub struct Gate {
     config: GateConfig,
-    robot: RobotId,
     directory: PathBuf,
 }
 
@@ -61,9 +61,9 @@ pub enum GateError {
 }
 
 impl Gate {
-    /// The gate of `robot`, run in `directory`.
-    pub fn new(config: GateConfig, robot: RobotId, directory: &Path) -> Self {
-        Self { config, robot, directory: directory.to_owned() }
+    /// The gate, run in `directory`.
+    pub fn new(config: GateConfig, directory: &Path) -> Self {
+        Self { config, directory: directory.to_owned() }
     }
 
     /// Asks the gate, run with `environment`. An error is the reason of the refusal. A setting
@@ -105,7 +105,7 @@ impl Gate {
         processes.end(KILL_TIMEOUT).await?;
         let (reader, writer) = io::pipe().map_err(failed)?;
         let mut environment = environment.clone();
-        environment.extend(self.question_environment(task, question, &mark));
+        environment.extend(question_environment(task, question, &mark));
         let mut child =
             program::spawn_gate(&self.config.command, &self.directory, &environment, writer)
                 .map_err(failed)?;
@@ -133,25 +133,21 @@ impl Gate {
             ExitStatus::Signal(_) => Err(GateError::Crashed { program: program(), status }),
         }
     }
+}
 
-    /// The question, as environment variables.
-    fn question_environment(
-        &self,
-        task: &TaskName,
-        question: &GateQuestion,
-        mark: &Path,
-    ) -> [(String, String); 7] {
-        [
-            ("TASKD_GATE_STEP", question.step.as_str().to_owned()),
-            ("TASKD_TASK", task.to_string()),
-            ("TASKD_VERSION", question.version.to_string()),
-            ("TASKD_DEPLOYMENT", question.deployment.to_string()),
-            ("TASKD_RUN", question.run.to_string()),
-            ("TASKD_ROBOT", self.robot.to_string()),
-            (RUN_DIR_VARIABLE, mark.display().to_string()),
-        ]
-        .map(|(name, value)| (name.to_owned(), value))
-    }
+/// The question, as environment variables.
+fn question_environment(
+    task: &TaskName,
+    question: &GateQuestion,
+    mark: &Path,
+) -> impl Iterator<Item = (String, String)> {
+    let asked = [
+        ("TASKD_GATE_STEP", question.step.as_str().to_owned()),
+        ("TASKD_RUN", question.run.to_string()),
+        (RUN_DIR_VARIABLE, mark.display().to_string()),
+    ];
+    let asked = asked.map(|(name, value)| (name.to_owned(), value));
+    task_variables(task, &question.version, &question.deployment).into_iter().chain(asked)
 }
 
 impl GateStep {

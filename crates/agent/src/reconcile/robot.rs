@@ -1,7 +1,6 @@
 //! The real robot. Each effect is a call to the module that owns the work; the module's error
 //! becomes a failure code and text. The robot holds no state beside its settings.
 
-use std::collections::BTreeMap;
 use std::error::Error;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, RwLock};
@@ -9,14 +8,14 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use task_proto::desired::settings::RobotSettings;
-use task_proto::desired::{BlobRef, DesiredState, PackageRef};
+use task_proto::desired::{BlobRef, DesiredState, PackageRef, RobotDescription};
 use task_proto::error_chain::chain;
 use task_proto::messages::report::{
     Failure, FailureCode, HostFacts, Isolation, Progress, TaskAccounts,
 };
 use task_proto::packages::manifest::TaskManifest;
 use task_proto::time::millis;
-use task_proto::{Digest, MacAddress, RobotId, TaskName};
+use task_proto::{DeploymentId, Digest, MacAddress, RobotId, TaskName};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
@@ -73,6 +72,7 @@ mod resolved;
 mod ros;
 mod runs;
 mod signers;
+mod task_environment;
 mod trees;
 
 /// The marker file in a version's directory after its build.
@@ -92,6 +92,8 @@ pub struct Robot {
     gate: Option<Gate>,
     registry: Registry,
     robot: RobotId,
+    /// The robot's name and labels at the server.
+    description: RwLock<RobotDescription>,
     supervisor: Supervisor,
     watcher: Watcher,
     graph: GraphAccess,
@@ -138,7 +140,7 @@ impl Robot {
             tracing::warn!(%error, "tasks can't run");
         }
         let accounts_data = data.clone();
-        let gate = config.gate.clone().map(|gate| Gate::new(gate, robot.clone(), data.root()));
+        let gate = config.gate.clone().map(|gate| Gate::new(gate, data.root()));
         Self {
             data,
             fetcher,
@@ -147,6 +149,7 @@ impl Robot {
             gate,
             registry,
             robot: robot.clone(),
+            description: RwLock::default(),
             watcher: Watcher::new(graph.clone(), Supervisor::of_this_program(cgroups.clone())),
             graph,
             supervisor: Supervisor::of_this_program(cgroups.clone()),
@@ -185,27 +188,6 @@ impl Robot {
     fn promise(&self, package: &PackageRef) -> Promise {
         fetch::stored_manifest(&self.data, package)
             .map_or_else(Promise::default, |manifest| Promise::of(&manifest))
-    }
-
-    /// The environment of processes that run as `user` with the home directory `home`. Also makes
-    /// the task's directories reachable for `user`.
-    fn environment_of(
-        &self,
-        task: &TaskName,
-        user: Option<&TaskUser>,
-        home: &Path,
-    ) -> Result<BTreeMap<String, String>, StepFailure> {
-        let mut environment = self.resolved().environment.clone();
-        if let Some(user) = user {
-            let opened = user
-                .make_home(home)
-                .and_then(|()| user.allow_traversal(&self.data.path_dirs(task)));
-            opened.map_err(|error| retryable_failure(FailureCode::IO_ERROR, &error, 0))?;
-            environment.insert("HOME".to_owned(), home.display().to_string());
-            environment
-                .extend(["USER", "LOGNAME"].map(|name| (name.to_owned(), user.name.clone())));
-        }
-        Ok(environment)
     }
 
     /// The resource limits of the task: from its package, else from this robot's settings.
@@ -382,6 +364,7 @@ impl Effects for Robot {
 
     fn apply_state(&self, state: &DesiredState) {
         self.adopt(&state.settings);
+        self.describe(&state.robot);
         self.signature_policy
             .iter()
             .for_each(|signature_policy| signature_policy.follow_evidence(state));
@@ -460,6 +443,7 @@ impl Effects for Robot {
     async fn build(
         &self,
         package: &PackageRef,
+        deployment: &DeploymentId,
         cancel: &CancellationToken,
     ) -> Result<(), StepFailure> {
         self.recheck_signatures(package)?;
@@ -469,7 +453,7 @@ impl Effects for Robot {
         self.verify(package, tool, Purpose::Build).await?;
         let user = self.accounts_of(&package.name)?.map(|pair| pair.build);
         let home = self.data.task(&package.name).build_home();
-        let environment = self.environment_of(&package.name, user.as_ref(), &home)?;
+        let environment = self.environment_of(package, deployment, user.as_ref(), &home)?;
         let spec = BuildSpec {
             tool,
             underlays: self.setup_files(&manifest)?,
@@ -497,7 +481,7 @@ impl Effects for Robot {
         question: &GateQuestion,
     ) -> Result<(), StepFailure> {
         let Some(gate) = &self.gate else { return Ok(()) };
-        let answer = gate.query(task, question, &self.resolved().environment).await;
+        let answer = gate.query(task, question, &self.robot_environment()).await;
         answer.map_err(|failure| StepFailure { failure, retry_after_ms: Some(0) })
     }
 
@@ -522,7 +506,9 @@ impl Effects for Robot {
             .map_err(|error| failed(&error))?;
         self.verify(&run.package, tool, Purpose::Start).await?;
         let user = self.accounts_of(task)?.map(|pair| pair.run);
-        let mut environment = self.environment_of(task, user.as_ref(), &task_dir.home())?;
+        let mut environment =
+            self.environment_of(&run.package, &run.deployment, user.as_ref(), &task_dir.home())?;
+        environment.extend(environment::graph_variables(&manifest.run.env));
         self.make_work_dir(&run.package, tool, user.clone()).await?;
         environment.extend(ros::node_logs(&version, user.as_ref()).await);
         durable::write(&version.run_script(), text.as_bytes(), 0o755)
@@ -652,7 +638,7 @@ impl Effects for Robot {
 
 #[cfg(test)]
 mod tests {
-    use task_proto::DeploymentId;
+    use std::collections::BTreeMap;
 
     use super::*;
     use crate::install::fetch::FetchSettings;

@@ -4,7 +4,10 @@
 
 use std::collections::BTreeMap;
 
+use task_proto::desired::RobotDescription;
+use task_proto::ids::LabelKey;
 use task_proto::messages::report::RosFacts;
+use task_proto::{DeploymentId, RobotId, RobotName, TaskName, Version};
 
 use crate::setup::installation::{Installation, RosVersion};
 
@@ -43,6 +46,48 @@ pub const ROS_VARIABLES: [&str; 20] = [
     "ROS_IP",
     "ROS_HOSTNAME",
 ];
+
+/// The variables of `run_env` that decide which ROS graph the task's nodes join. The agent must know
+/// them to find the nodes.
+pub fn graph_variables(
+    run_env: &BTreeMap<String, String>,
+) -> impl Iterator<Item = (String, String)> {
+    let of_graph = |name: &str| name == "ROS_DOMAIN_ID" || ROS_VARIABLES.contains(&name);
+    let pairs = run_env.iter().filter(move |(name, _)| of_graph(name));
+    pairs.map(|(name, value)| (name.clone(), value.clone()))
+}
+
+/// The variables that name the robot. A server of an earlier version does not send the robot's name;
+/// its id stands in.
+pub fn robot_variables(id: &RobotId, robot: &RobotDescription) -> BTreeMap<String, String> {
+    let mut variables = BTreeMap::new();
+    // Of several keys with the same variable, the first in the order of their bytes counts.
+    for (key, value) in &robot.labels {
+        variables.entry(label_variable(key)).or_insert_with(|| value.to_string());
+    }
+    let name = robot.name.as_ref().map_or(id.as_str(), RobotName::as_str);
+    variables.insert("TASKD_ROBOT".to_owned(), name.to_owned());
+    variables.insert("TASKD_ROBOT_ID".to_owned(), id.to_string());
+    variables
+}
+
+fn label_variable(key: &LabelKey) -> String {
+    let plain = |c: char| if c.is_ascii_alphanumeric() { c.to_ascii_uppercase() } else { '_' };
+    format!("TASKD_LABEL_{}", key.as_str().chars().map(plain).collect::<String>())
+}
+
+/// The variables that name a task and its order.
+pub fn task_variables(
+    task: &TaskName,
+    version: &Version,
+    deployment: &DeploymentId,
+) -> [(String, String); 3] {
+    [
+        ("TASKD_TASK".to_owned(), task.to_string()),
+        ("TASKD_VERSION".to_owned(), version.to_string()),
+        ("TASKD_DEPLOYMENT".to_owned(), deployment.to_string()),
+    ]
+}
 
 /// The discovery method of nodes with this environment, if the agent can't take part in it.
 pub fn unsupported_discovery(environment: &BTreeMap<String, String>) -> Option<&'static str> {
@@ -160,6 +205,27 @@ mod tests {
         );
         let given = environment(&[("ROS_IP", "127.0.0.1"), ("ROS_DOMAIN_ID", "7")]);
         assert_eq!(ros_facts(&all[..1], &given), facts("noetic", None, None, true));
+    }
+
+    #[test]
+    fn label_variables_are_upper_case_and_the_first_of_equal_ones_counts() {
+        let id: RobotId = "r0123456789abcdef".parse().expect("valid");
+        let labels = [("site", "lab"), ("rack.no-1", "b"), ("rack-no.1", "a"), ("Rack_no_1", "c")];
+        let labels = labels
+            .map(|(key, value)| (key.parse().expect("a key"), value.parse().expect("a value")));
+        let mut robot = RobotDescription { name: None, labels: labels.into() };
+        let expected = |name: &str| {
+            let pairs = [
+                ("TASKD_LABEL_RACK_NO_1", "c"),
+                ("TASKD_LABEL_SITE", "lab"),
+                ("TASKD_ROBOT", name),
+                ("TASKD_ROBOT_ID", "r0123456789abcdef"),
+            ];
+            BTreeMap::from(pairs.map(|(name, value)| (name.to_owned(), value.to_owned())))
+        };
+        assert_eq!(robot_variables(&id, &robot), expected("r0123456789abcdef"));
+        robot.name = Some("atlas".parse().expect("valid"));
+        assert_eq!(robot_variables(&id, &robot), expected("atlas"));
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! The generated scripts: `run.sh`, which starts the task, `build.sh`, which builds it, and the
 //! probe's script, which queries the contents of an underlay. Pure text. A value from a manifest
-//! only ever appears in single quotes, never as shell.
+//! only ever appears in single quotes, never as shell; the names of variables in `run.env` were checked
+//! with the manifest.
 //!
 //! A task runs in its version's `work` directory, which [`crate::install::work_dir`] fills with
 //! links. So `exec = ["install/talker/lib/talker/talker"]` works for a built task, and
@@ -40,6 +41,9 @@ pub fn run_script(manifest: &TaskManifest, version: &VersionDir, underlays: &[Pa
         script.push_str(&format!("if [ -r {setup} ]; then . {setup}; fi\n"));
     }
     enter(&mut script, &version.work());
+    for (name, value) in &manifest.run.env {
+        script.push_str(&format!("export {name}={}\n", quote(value)));
+    }
     let words = launch::of(manifest).command.iter().map(|word| quote(word)).collect::<Vec<_>>();
     script.push_str(&format!("exec -- {}\n", words.join(" ")));
     script
@@ -222,6 +226,24 @@ exec -- 'ros2' 'launch' 'talker' 'talk.launch.py' 'frame:=it'\''s $(here)'
         let (version, _) = version("/data");
         let script = run_script(&manifest(BuildTool::Catkin, run), &version, &[]);
         assert!(script.ends_with("exec -- 'roslaunch' 'base' 'base.launch'\n"), "{script}");
+    }
+
+    #[test]
+    fn variables_of_the_package_override_the_setup_files_and_are_literal() {
+        let temp = tempfile::tempdir().unwrap();
+        let root = temp.path().canonicalize().unwrap();
+        let (version, _) = version(&root.display().to_string());
+        std::fs::create_dir_all(version.work()).unwrap();
+        let underlay = root.join("setup.bash");
+        std::fs::write(&underlay, "export A=underlay B=underlay\n").unwrap();
+        let value = "it's $HOME `id`\n second line";
+        let run = Run {
+            exec: Some(["printenv", "A", "B"].map(str::to_owned).to_vec()),
+            env: BTreeMap::from([("A".to_owned(), value.to_owned())]),
+            ..Run::default()
+        };
+        let script = run_script(&manifest(BuildTool::None, run), &version, &[underlay]);
+        assert_eq!(bash(&script), format!("{value}\nunderlay\n").as_bytes());
     }
 
     #[expect(clippy::disallowed_methods, reason = "only bash can tell how it reads a text")]

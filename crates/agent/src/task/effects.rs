@@ -7,7 +7,7 @@ use std::future::Future;
 use bytes::Bytes;
 use task_proto::desired::{BlobRef, DesiredState, PackageRef};
 use task_proto::messages::report::{HostFacts, Progress};
-use task_proto::{Digest, TaskName};
+use task_proto::{DeploymentId, Digest, TaskName};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
@@ -128,9 +128,11 @@ pub trait Effects: Send + Sync + 'static {
         cancel: &CancellationToken,
     ) -> impl Future<Output = Result<Done, StepFailure>> + Send;
 
+    /// Builds the unpacked package for a run of this deployment.
     fn build(
         &self,
         package: &PackageRef,
+        deployment: &DeploymentId,
         cancel: &CancellationToken,
     ) -> impl Future<Output = Result<(), StepFailure>> + Send;
 

@@ -84,6 +84,7 @@ fn state(robot: &RobotId, generation: u64) -> DesiredState {
         tasks: Vec::new(),
         evidence: Default::default(),
         settings: Default::default(),
+        robot: Default::default(),
     }
 }
 

@@ -225,6 +225,7 @@ fn doctor_checks_settings_from_the_server() {
         tasks: Vec::new(),
         evidence: Default::default(),
         settings: serde_json::from_value(json!({ "workspace": "/nowhere/ws" })).unwrap(),
+        robot: Default::default(),
     };
     let envelope = Envelope::seal(DESIRED_STATE_TYPE, &serde_json::to_vec(&state).unwrap(), &key);
     let mut ledger = Ledger::new(0);

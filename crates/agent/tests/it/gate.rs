@@ -11,7 +11,7 @@ use task_agent::process::containment::Containment;
 use task_agent::reconcile::gate::Gate;
 use task_agent::task::ledger::{GateQuestion, GateStep};
 use task_proto::messages::report::Failure;
-use task_proto::{DeploymentId, RobotId, TaskName};
+use task_proto::{DeploymentId, TaskName};
 
 use crate::harness::eventually;
 
@@ -35,9 +35,8 @@ async fn ask_program(
     default: GateDefault,
 ) -> Result<(), Failure> {
     let command = vec![program.display().to_string(), "an argument".to_owned()];
-    let robot: RobotId = "r0123456789abcdef".parse().expect("valid");
     let environment = BTreeMap::from([("PATH".to_owned(), "/usr/bin:/bin".to_owned())]);
-    let gate = Gate::new(GateConfig { command, timeout, default }, robot, dir);
+    let gate = Gate::new(GateConfig { command, timeout, default }, dir);
     let question = GateQuestion {
         step: GateStep::Switch,
         deployment: DeploymentId::random(),
@@ -59,7 +58,7 @@ async fn gate_receives_the_question_and_its_reason_is_kept() {
     let dir = tempfile::tempdir().expect("a directory");
     let asked = "[ \"$TASKD_GATE_STEP $TASKD_TASK $TASKD_VERSION $TASKD_RUN $1\" \
                  = 'switch talker 1.1 3 an argument' ] \
-                 && [ -n \"$TASKD_DEPLOYMENT\" ] && [ $TASKD_ROBOT = r0123456789abcdef ]";
+                 && [ -n \"$TASKD_DEPLOYMENT\" ]";
     assert_eq!(ask(dir.path(), asked, LONG, GateDefault::Deny).await, Ok(()));
     let refusal = ask(
         dir.path(),

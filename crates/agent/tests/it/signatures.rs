@@ -221,6 +221,7 @@ impl Robot {
             tasks: vec![order(package)],
             evidence,
             settings: Default::default(),
+            robot: Default::default(),
         });
     }
 
@@ -417,7 +418,7 @@ async fn steps_recheck_trust_and_do_nothing_if_revoked() {
         robot.pull_manifest(&talker, &cancel).await.map(drop),
         robot.pull_content(&talker, &progress, &cancel).await.map(drop),
         robot.gather_content(&talker, &progress, &part_requests, &cancel).await.map(drop),
-        robot.build(&talker, &cancel).await,
+        robot.build(&talker, &DeploymentId::random(), &cancel).await,
         robot.start(&talker.name, &run).await.map(drop),
     ];
     for (at, outcome) in outcomes.into_iter().enumerate() {

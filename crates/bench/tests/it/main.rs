@@ -14,6 +14,7 @@ mod crash;
 mod delivery;
 mod direct_push;
 mod doctor;
+mod environment;
 mod flood;
 mod graph_loss;
 mod harness;

@@ -11,11 +11,12 @@ use std::fmt;
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 
-use crate::desired::settings::{RobotSettings, read_known_settings};
+use crate::desired::settings::{RobotSettings, default_if_unreadable, read_known_settings};
+use crate::ids::Labels;
 use crate::trust::envelope::Envelope;
-use crate::{DeploymentId, Digest, Generation, RobotId, TaskName, Version};
+use crate::{DeploymentId, Digest, Generation, RobotId, RobotName, TaskName, Version};
 
 /// The largest [`Envelope`], in bytes of JSON, that travels inside an MQTT message. For a larger
 /// one, the message has only the generation.
@@ -48,6 +49,42 @@ pub struct DesiredState {
         deserialize_with = "read_known_settings"
     )]
     pub settings: RobotSettings,
+    /// The robot's name and labels, for the environment of its tasks. Like the evidence, they may
+    /// change without a new generation. Absent from earlier servers.
+    #[serde(
+        default,
+        skip_serializing_if = "RobotDescription::is_empty",
+        deserialize_with = "default_if_unreadable"
+    )]
+    pub robot: RobotDescription,
+}
+
+/// The name and labels that the server holds of a robot.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct RobotDescription {
+    /// The robot's name.
+    #[serde(skip_serializing_if = "Option::is_none", deserialize_with = "default_if_unreadable")]
+    pub name: Option<RobotName>,
+    /// The robot's labels.
+    #[serde(skip_serializing_if = "Labels::is_empty", deserialize_with = "readable_labels")]
+    pub labels: Labels,
+}
+
+/// Reads the labels that this version can read: labels must not make a state unreadable.
+fn readable_labels<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Labels, D::Error> {
+    let given: serde_json::Map<_, _> = default_if_unreadable(deserializer)?;
+    let readable = given
+        .into_iter()
+        .filter_map(|(key, value)| Some((key.parse().ok()?, value.as_str()?.parse().ok()?)));
+    Ok(readable.collect())
+}
+
+impl RobotDescription {
+    /// Whether nothing is known of the robot.
+    pub fn is_empty(&self) -> bool {
+        *self == Self::default()
+    }
 }
 
 /// References to blobs that publishers have signed, see [`crate::packages::publisher`]. The
@@ -271,6 +308,17 @@ mod tests {
 
     fn blob(bytes: &[u8]) -> BlobRef {
         BlobRef { digest: Digest::of(bytes), size: bytes.len() as u64 }
+    }
+
+    #[test]
+    fn unreadable_label_leaves_the_others() {
+        let read = |value| serde_json::from_value::<RobotDescription>(value).expect("reads");
+        let robot = read(serde_json::json!({
+            "name": {"first": "atlas"}, "labels": {"site": "lab", "a b": "x", "n": 7},
+        }));
+        let site = ("site".parse().expect("a key"), "lab".parse().expect("a value"));
+        assert_eq!(robot, RobotDescription { name: None, labels: [site].into() });
+        assert_eq!(read(serde_json::json!({"labels": 7})), RobotDescription::default());
     }
 
     #[test]

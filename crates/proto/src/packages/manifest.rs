@@ -29,6 +29,26 @@ pub const MAX_CONTENT_RATIO: u64 = 200;
 /// Content up to this size may have any compression ratio.
 pub const CONTENT_RATIO_FREE_BYTES: u64 = 64 << 20;
 
+/// The most variables in `run.env`.
+pub const MAX_ENV_VARIABLES: usize = 128;
+/// The longest name of a variable in `run.env`, in bytes.
+pub const MAX_ENV_NAME_BYTES: usize = 128;
+/// The most bytes of all names and values in `run.env` together.
+pub const MAX_ENV_BYTES: usize = 64 * 1024;
+/// Variables that bash refuses to change or overwrites before it starts a program.
+const SHELL_VARIABLES: [&str; 10] = [
+    "_",
+    "BASHOPTS",
+    "BASH_VERSINFO",
+    "EUID",
+    "OLDPWD",
+    "PPID",
+    "PWD",
+    "SHELLOPTS",
+    "SHLVL",
+    "UID",
+];
+
 /// Description of a package: how the package is built, run and watched.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
@@ -100,6 +120,9 @@ pub struct Run {
     /// Launch arguments, `name:=value`.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub args: BTreeMap<String, String>,
+    /// Environment variables of the task, set after the ROS setup files have been sourced.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub env: BTreeMap<String, String>,
     /// Service or job.
     #[serde(default)]
     pub kind: TaskKind,
@@ -126,6 +149,7 @@ impl Default for Run {
             launch: None,
             exec: None,
             args: BTreeMap::new(),
+            env: BTreeMap::new(),
             kind: TaskKind::default(),
             on_boot: OnBoot::default(),
             restart: Restart::default(),
@@ -370,6 +394,7 @@ impl TaskManifest {
                 problems.add("run.args", format!("{name:?} {reason}"));
             }
         }
+        self.check_env(problems);
         if !(1..=600).contains(&run.stop_timeout_s) {
             problems.add("run.stop_timeout_s", "must be between 1 and 600".to_owned());
         }
@@ -381,6 +406,40 @@ impl TaskManifest {
         }
         if run.deadline_s.is_some_and(|seconds| !(1..=30 * 24 * 3600).contains(&seconds)) {
             problems.add("run.deadline_s", "must be between 1 and 2592000".to_owned());
+        }
+    }
+
+    fn check_env(&self, problems: &mut Problems) {
+        let env = &self.run.env;
+        if env.len() > MAX_ENV_VARIABLES {
+            problems.add("run.env", format!("more than {MAX_ENV_VARIABLES} variables"));
+        }
+        let bytes: usize = env.iter().map(|(name, value)| name.len() + value.len() + 2).sum();
+        if bytes > MAX_ENV_BYTES {
+            let reason = format!("names and values have {bytes} bytes, more than {MAX_ENV_BYTES}");
+            problems.add("run.env", reason);
+        }
+        for (name, value) in env {
+            let key = format!("run.env.{name}");
+            let is_plain = |c: char| c.is_ascii_alphanumeric() || c == '_';
+            if !name.chars().all(is_plain) || name.starts_with(|c: char| c.is_ascii_digit()) {
+                let key = format!("run.env.{name:?}");
+                let reason = "is not the name of a variable: letters, digits and _, \
+                              and no digit first";
+                problems.add(&key, reason.to_owned());
+            } else if name.is_empty() {
+                problems.add("run.env.\"\"", "a variable needs a name".to_owned());
+            } else if name.len() > MAX_ENV_NAME_BYTES {
+                problems.add(&key, format!("its name is longer than {MAX_ENV_NAME_BYTES} bytes"));
+            } else if name.starts_with("TASKD_") {
+                let reason = "names that begin with TASKD_ are the agent's".to_owned();
+                problems.add(&key, reason);
+            } else if SHELL_VARIABLES.contains(&name.as_str()) {
+                problems.add(&key, "bash, which starts the task, sets it itself".to_owned());
+            }
+            if value.contains('\0') {
+                problems.add(&key, "has a NUL, which no variable can hold".to_owned());
+            }
         }
     }
 
@@ -507,6 +566,20 @@ mod tests {
     }
 
     #[test]
+    fn variables_are_limited_in_count_and_size() {
+        let of = |count: usize, value: &str| {
+            let env = (0..count).map(|n| (format!("_n{n:03}"), value.to_owned())).collect();
+            manifest(Run { env, ..run(&["true"]) }).problems()
+        };
+        assert_eq!(of(MAX_ENV_VARIABLES, "several\nlines, $(no) 'command'"), []);
+        assert_eq!(of(MAX_ENV_VARIABLES + 1, "")[0].key, "run.env");
+        assert_eq!(of(2, &"x".repeat(MAX_ENV_BYTES / 2 - 7)), []);
+        assert_eq!(of(2, &"x".repeat(MAX_ENV_BYTES / 2))[0].key, "run.env");
+        let long = Run { env: [("N".repeat(129), String::new())].into(), ..run(&["true"]) };
+        assert!(manifest(long).problems()[0].reason.contains("longer than 128 bytes"));
+    }
+
+    #[test]
     fn problems_name_the_users_key() {
         let keys = |manifest: &TaskManifest| {
             manifest.problems().into_iter().map(|p| p.key).collect::<Vec<_>>()
@@ -517,6 +590,13 @@ mod tests {
         let launch = Some(["talker".to_owned(), "talker.launch.py".to_owned()]);
         let args = [("map".to_owned(), String::new())].into();
         assert_eq!(keys(&manifest(Run { launch, args, ..Run::default() })), ["run.args"]);
+        let env =
+            ["", "A-B", "1ST", "é", "TASKD_ROBOT", "UID"].map(|name| (name.into(), "".into()));
+        let named = Run { env: env.into(), ..run(&["true"]) };
+        let expected = ["\"\"", "\"1ST\"", "\"A-B\"", "TASKD_ROBOT", "UID", "\"é\""];
+        assert_eq!(keys(&manifest(named)), expected.map(|name| format!("run.env.{name}")));
+        let odd = Run { env: [("A".into(), "a\0".into())].into(), ..run(&["true"]) };
+        assert_eq!(keys(&manifest(odd)), ["run.env.A"]);
         let mut odd = manifest(run(&["true"]));
         odd.ready.nodes = vec!["mapper".to_owned()];
         odd.outputs.paths = vec!["../secrets".to_owned()];

@@ -17,7 +17,7 @@ use task_proto::api::{
 };
 use task_proto::desired::{
     BlobRef, Delivery, DesiredNotice, DesiredState, DesiredTask, Evidence, Inline, PackageRef,
-    SignatureRef, TargetState,
+    RobotDescription, SignatureRef, TargetState,
 };
 use task_proto::messages::part::{Part, PartRange};
 use task_proto::messages::report::{
@@ -85,6 +85,10 @@ fn desired_state() -> DesiredState {
             }],
         },
         settings: crate::fleet::settings(),
+        robot: RobotDescription {
+            name: Some(parsed("atlas")),
+            labels: [(parsed("site"), parsed("lab"))].into(),
+        },
     }
 }
 

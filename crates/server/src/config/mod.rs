@@ -281,10 +281,21 @@ pub enum ConfigError {
 }
 
 /// Variables that other commands and tasks use; `serve` ignores them.
-const FOREIGN_VARIABLES: [&str; 5] =
-    ["TASKD_SERVER", "TASKD_TOKEN", "TASKD_PIN", "TASKD_ASSIGNMENT", "TASKD_LOG"];
-/// The prefix of the test suite's own variables.
-const TEST_VARIABLES: &str = "TASKD_TEST_";
+const FOREIGN_VARIABLES: [&str; 11] = [
+    "TASKD_SERVER",
+    "TASKD_TOKEN",
+    "TASKD_PIN",
+    "TASKD_LOG",
+    "TASKD_ASSIGNMENT",
+    "TASKD_RUN_DIR",
+    "TASKD_ROBOT",
+    "TASKD_ROBOT_ID",
+    "TASKD_TASK",
+    "TASKD_VERSION",
+    "TASKD_DEPLOYMENT",
+];
+/// The prefixes of a task's labels and of the test suite's own variables.
+const FOREIGN_PREFIXES: [&str; 2] = ["TASKD_LABEL_", "TASKD_TEST_"];
 /// Maximum size of a configuration file.
 const MAX_FILE_BYTES: u64 = 1024 * 1024;
 
@@ -515,7 +526,7 @@ impl Config {
             };
             if name == "TASKD_CONFIG"
                 || FOREIGN_VARIABLES.contains(&name)
-                || name.starts_with(TEST_VARIABLES)
+                || FOREIGN_PREFIXES.iter().any(|prefix| name.starts_with(prefix))
             {
                 continue;
             }
@@ -671,8 +682,15 @@ mod tests {
             let message = load(&[], &[], Some(file)).expect_err(expected);
             assert!(message.starts_with(expected), "{message}");
         }
-        let config = load(&[], &[("TASKD_SERVER", "http://x"), ("TASKD_TEST_POSTGRES", "x")], None);
-        assert!(config.is_ok());
+        // A server may be a task of another one.
+        let foreign = [
+            "TASKD_SERVER",
+            "TASKD_TEST_POSTGRES",
+            "TASKD_ROBOT",
+            "TASKD_RUN_DIR",
+            "TASKD_LABEL_SITE",
+        ];
+        load(&[], &foreign.map(|name| (name, "x")), None).expect("loads");
     }
 
     #[test]

@@ -5,7 +5,7 @@
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use task_proto::desired::{BlobRef, DesiredState, Evidence};
+use task_proto::desired::{BlobRef, DesiredState, Evidence, RobotDescription};
 use task_proto::trust::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
 use task_proto::{Generation, RobotId};
 
@@ -56,6 +56,7 @@ struct CachedEnvelope {
     issued_at_ms: u64,
     generation: Generation,
     evidence: Evidence,
+    description: RobotDescription,
     envelope: Envelope,
 }
 
@@ -64,16 +65,12 @@ struct CachedEnvelope {
 struct EnvelopeCache(Mutex<HashMap<RobotId, CachedEnvelope>>);
 
 impl EnvelopeCache {
-    fn get(
-        &self,
-        robot: &RobotId,
-        generation: Generation,
-        evidence: &Evidence,
-        signed_since_ms: u64,
-    ) -> Option<Envelope> {
+    fn get(&self, found: &DesiredTasks, signed_since_ms: u64) -> Option<Envelope> {
         let cached = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let cached = cached.get(robot)?;
-        let is_same = cached.generation == generation && cached.evidence == *evidence;
+        let cached = cached.get(&found.robot)?;
+        let is_same = cached.generation == found.generation
+            && cached.evidence == found.evidence
+            && cached.description == found.description;
         (is_same && cached.issued_at_ms >= signed_since_ms).then(|| cached.envelope.clone())
     }
 
@@ -126,21 +123,14 @@ impl DesiredStates {
 
     /// Signs a state, unless the robot has diverged.
     fn sign(&self, found: DesiredTasks) -> Option<SignedState> {
-        let DesiredTasks {
-            robot,
-            generation,
-            observed_generation,
-            tasks,
-            bundled_blobs,
-            evidence,
-            settings,
-        } = found;
-        if observed_generation > generation {
+        if found.observed_generation > found.generation {
             return None;
         }
         let issued_at_ms = self.clock.now_ms();
         let signed_since_ms = issued_at_ms.saturating_sub(self.lifetime_ms / 2);
-        if let Some(envelope) = self.cache.get(&robot, generation, &evidence, signed_since_ms) {
+        let cached = self.cache.get(&found, signed_since_ms);
+        let DesiredTasks { robot, generation, tasks, bundled_blobs, evidence, .. } = found;
+        if let Some(envelope) = cached {
             return Some(SignedState { generation, envelope, bundled_blobs });
         }
         let state = DesiredState {
@@ -150,12 +140,18 @@ impl DesiredStates {
             expires_at_ms: issued_at_ms + self.lifetime_ms,
             tasks,
             evidence: evidence.clone(),
-            settings,
+            settings: found.settings,
+            robot: found.description.clone(),
         };
         let payload = serde_json::to_vec(&state).expect("a desired state always has a JSON form");
         let envelope = Envelope::seal(DESIRED_STATE_TYPE, &payload, &self.key);
-        let signed =
-            CachedEnvelope { issued_at_ms, generation, evidence, envelope: envelope.clone() };
+        let signed = CachedEnvelope {
+            issued_at_ms,
+            generation,
+            evidence,
+            description: found.description,
+            envelope: envelope.clone(),
+        };
         self.cache.insert(&robot, signed);
         Some(SignedState { generation, envelope, bundled_blobs })
     }

@@ -2,8 +2,9 @@
 
 use serde_json::json;
 use task_proto::Generation;
-use task_proto::api::{EditRobot, MAX_TIMELINE, PastAssignment};
+use task_proto::api::{BulkLabels, EditRobot, MAX_TIMELINE, PastAssignment};
 use task_proto::desired::settings::RobotSettings;
+use task_proto::ids::Labels;
 use task_proto::messages::report::Phase;
 use taskd::orders::actions::TaskOrder;
 use taskd::store::{HistoryPage, HistoryQuery};
@@ -17,6 +18,7 @@ on_both_databases! {
     running_task_returns_to_its_timeline,
     robot_history_is_read_in_pages,
     settings_are_part_of_the_desired_state,
+    name_and_labels_are_part_of_the_desired_state,
 }
 
 async fn history(fleet: &Fleet, robot: &Robot, query: HistoryQuery<'_>) -> HistoryPage {
@@ -207,7 +209,52 @@ async fn settings_are_part_of_the_desired_state(database: TestDatabase) {
     assert_eq!(fleet.desired(&robots[0]).await.expect("a state").settings, wanted, "absent stays");
     set(serde_json::Value::Null).await.expect("cleared");
     let cleared = fleet.desired(&robots[0]).await.expect("a state");
-    assert_eq!((cleared.generation.0, cleared.settings.is_empty()), (state.generation.0 + 1, true));
+    assert_eq!((cleared.generation.0, cleared.settings.is_empty()), (state.generation.0 + 2, true));
     assert_eq!(fleet.view(&robots[0]).await.settings, None);
     assert!(fleet.desired(&robots[1]).await.expect("a state").settings.is_empty());
+}
+
+async fn name_and_labels_are_part_of_the_desired_state(database: TestDatabase) {
+    let fleet = Fleet::new(database).await;
+    let mut robots = fleet.enroll(2).await;
+    let site = |value: &str| {
+        Labels::from([("site".parse().expect("a key"), value.parse().expect("a value"))])
+    };
+    let edit = async |robot: &Robot, labels: Labels| {
+        let edit = EditRobot { labels: Some(labels), ..EditRobot::default() };
+        fleet.robots.edit(&fleet.operator, &robot.id, &edit).await.expect("edited");
+        fleet.desired(robot).await.expect("a state")
+    };
+    let before = fleet.desired(&robots[0]).await.expect("a state");
+    let named = edit(&robots[0], site("lab")).await;
+    assert_eq!(named.robot.labels, site("lab"), "no state of before the change");
+    assert_eq!(named.generation, before.generation, "nothing is ordered yet");
+    fleet.deploy("1.0.0", |_| {}).await;
+    let ordered = fleet.desired(&robots[0]).await.expect("a state");
+    fleet.changes.take_robots_to_notify().await;
+    let moved = edit(&robots[0], site("yard")).await;
+    assert_eq!((&moved.robot.labels, &moved.tasks), (&site("yard"), &ordered.tasks));
+    assert_eq!(moved.generation.0, ordered.generation.0 + 1);
+    assert_eq!(fleet.changes.take_robots_to_notify().await.robots, [robots[0].id.clone()].into());
+    assert_eq!(edit(&robots[0], site("yard")).await.generation, moved.generation, "nothing is new");
+    let order = BulkLabels {
+        selector: "*".parse().expect("a selector"),
+        set: site("yard"),
+        remove: Vec::new(),
+        dry_run: false,
+    };
+    let second = fleet.desired(&robots[1]).await.expect("a state");
+    fleet.robots.label_selected(&fleet.operator, None, &order).await.expect("labelled");
+    let labelled = fleet.desired(&robots[1]).await.expect("a state");
+    assert_eq!(labelled.robot.labels, site("yard"));
+    assert_eq!(labelled.generation.0, second.generation.0 + 1);
+    assert_eq!(fleet.desired(&robots[0]).await.expect("a state").generation, moved.generation);
+    assert_eq!(fleet.changes.take_robots_to_notify().await.robots, [robots[1].id.clone()].into());
+
+    // A robot with a later state than the database keeps its tasks until the next order.
+    robots[0].observed = Generation(moved.generation.0 + 1);
+    fleet.report(&mut robots[0]).await;
+    let edited = EditRobot { labels: Some(site("hall")), ..EditRobot::default() };
+    fleet.robots.edit(&fleet.operator, &robots[0].id, &edited).await.expect("edited");
+    assert!(fleet.desired(&robots[0]).await.is_err(), "the state of before the copy was sent");
 }

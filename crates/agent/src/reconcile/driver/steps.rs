@@ -62,7 +62,7 @@ impl<E: Effects> Driver<E> {
                             () = forward_part_requests(requested_parts, &news) => unreachable!("the forwarder never returns"),
                         }
                     }
-                    Step::Build(package) => effects.build(package, &stop).await.map(done),
+                    Step::Build { package, deployment } => effects.build(package, deployment, &stop).await.map(done),
                     Step::QueryGate(question) => effects.query_gate(&name, question).await.map(done),
                     Step::Start(run) => effects.start(&name, run).await.map(Done::Started),
                     Step::Stop(run) => effects.stop(&name, run).await.map(done),

@@ -89,6 +89,7 @@ impl Bench {
             tasks,
             evidence: Default::default(),
             settings: Default::default(),
+            robot: Default::default(),
         };
         let payload = serde_json::to_vec(&state).expect("json");
         let envelope = Box::new(Envelope::seal(DESIRED_STATE_TYPE, &payload, key));

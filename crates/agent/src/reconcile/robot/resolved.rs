@@ -122,15 +122,19 @@ mod tests {
     use crate::task::ledger::{GateQuestion, GateStep};
 
     #[tokio::test]
-    async fn gate_runs_in_the_ros_domain_set_by_the_server() {
+    async fn gate_gets_the_ros_domain_the_name_and_the_labels_of_the_server() {
         let temp = tempfile::tempdir().expect("a directory");
         let program = temp.path().join("gate.sh");
-        std::fs::write(&program, "#!/bin/sh\necho \"domain $ROS_DOMAIN_ID\"\nexit 1\n")
+        std::fs::write(&program, "#!/bin/sh\necho \"$ROS_DOMAIN_ID $TASKD_ROBOT $TASKD_LABEL_SITE $TASKD_TASK\"\nexit 1\n")
             .expect("written");
         std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755))
             .expect("executable");
         let robot = robot(temp.path(), &format!("[gate]\ncommand = [{program:?}]\n"));
         robot.adopt(&serde_json::from_value(json!({ "ros_domain_id": 7 })).expect("parses"));
+        robot.describe(
+            &serde_json::from_value(json!({"name": "atlas", "labels": {"site": "lab"}}))
+                .expect("parses"),
+        );
         let question = GateQuestion {
             step: GateStep::Start,
             deployment: DeploymentId::random(),
@@ -139,6 +143,6 @@ mod tests {
         };
         let refused =
             robot.query_gate(&"talker".parse().expect("valid"), &question).await.expect_err("no");
-        assert_eq!(refused.failure.text, "domain 7");
+        assert_eq!(refused.failure.text, "7 atlas lab talker");
     }
 }

@@ -57,7 +57,7 @@ mod tests {
     use task_proto::messages::report::FailureCode;
     use task_proto::packages::publisher::PackageStatement;
     use task_proto::trust::envelope::SigningKey;
-    use task_proto::{Digest, Generation, RobotId};
+    use task_proto::{DeploymentId, Digest, Generation, RobotId};
 
     use super::super::tests::robot;
     use super::*;
@@ -111,11 +111,12 @@ mod tests {
             tasks: Vec::new(),
             evidence: Evidence { lists: Vec::new(), signatures },
             settings: Default::default(),
+            robot: Default::default(),
         });
         let cancel = CancellationToken::new();
         try_full(dir, async || robot.check_signers(&package, &cancel).await).await;
         try_full(dir, async || robot.pull_manifest(&package, &cancel).await.map(drop)).await;
-        try_full(dir, async || robot.build(&package, &cancel).await).await;
+        try_full(dir, async || robot.build(&package, &DeploymentId::random(), &cancel).await).await;
     }
 
     #[test]

@@ -68,7 +68,9 @@ pub fn prepare(s: &PlanInput<'_>) -> Next {
         return Next::Act(Step::PullContent { package: package.clone(), is_pushed });
     }
     if !s.prepared.built {
-        return Next::Act(Step::Build(package.clone()));
+        let restored = s.record.run_to_restore().map(|(run, _)| &run.deployment);
+        let deployment = restored.unwrap_or(&order.deployment).clone();
+        return Next::Act(Step::Build { package: package.clone(), deployment });
     }
     if restores {
         return change(s, |record| record.restoring = None);
@@ -101,7 +103,7 @@ fn enter_phase(s: &PlanInput<'_>, phase: Phase, failure: Option<Failure>) -> Nex
 /// Counts the attempt that `step` is.
 pub(super) fn begin(preparation: &mut Preparation, step: &Step) {
     let phase = match step {
-        Step::Build(_) => Phase::Building,
+        Step::Build { .. } => Phase::Building,
         _ => Phase::Fetching,
     };
     let is_repeated = preparation.phase == phase && preparation.failure.is_some();

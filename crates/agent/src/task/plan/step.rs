@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use task_proto::desired::{DesiredTask, PackageRef, TargetState};
 use task_proto::messages::report::Failure;
-use task_proto::{Digest, TaskName};
+use task_proto::{DeploymentId, Digest, TaskName};
 
 use crate::task::ledger::{GateQuestion, OutputUpload, TaskRecord};
 use crate::task::run::ActiveRun;
@@ -34,7 +34,11 @@ pub enum Step {
         is_pushed: bool,
     },
     /// Build the unpacked package, whose tree never changes afterwards.
-    Build(PackageRef),
+    Build {
+        package: PackageRef,
+        /// The deployment whose run needs the build.
+        deployment: DeploymentId,
+    },
     /// Ask the robot's gate.
     QueryGate(GateQuestion),
     /// Make this run the active run and start a process of the run.
@@ -104,7 +108,7 @@ impl Step {
             | Self::PullManifest(_)
             | Self::ProbeRos(_)
             | Self::PullContent { .. }
-            | Self::Build(_) => Lane::Prepare,
+            | Self::Build { .. } => Lane::Prepare,
             Self::Start(_) | Self::Stop(_) | Self::Prune { .. } | Self::Remove => Lane::Run,
             Self::QueryGate(_) => Lane::Gate,
             Self::UploadOutputs(_) => Lane::Upload,
@@ -118,7 +122,7 @@ impl Step {
             | Self::PullManifest(package)
             | Self::ProbeRos(package)
             | Self::PullContent { package, .. }
-            | Self::Build(package) => Some(package),
+            | Self::Build { package, .. } => Some(package),
             _ => None,
         }
     }
@@ -127,7 +131,7 @@ impl Step {
     /// its time: they watch for stalls instead. Builds have limits of their own.
     pub fn deadline(&self) -> Option<Duration> {
         let seconds = match self {
-            Self::PullContent { .. } | Self::Build(_) | Self::UploadOutputs(_) => return None,
+            Self::PullContent { .. } | Self::Build { .. } | Self::UploadOutputs(_) => return None,
             Self::CheckSigners(_) | Self::PullManifest(_) | Self::ProbeRos(_) => STEP_DEADLINE_S,
             Self::Start(_) => STEP_DEADLINE_S + VERIFY_DEADLINE_S,
             // The gate's own, shorter limit is a setting.
@@ -185,7 +189,7 @@ pub fn describe(task: &TaskName, step: &Step) -> String {
         Step::PullContent { package, is_pushed: true } => {
             format!("gather {task} {}", package.version)
         }
-        Step::Build(package) => format!("build {task} {}", package.version),
+        Step::Build { package, .. } => format!("build {task} {}", package.version),
         Step::QueryGate(question) => format!("ask the gate about {task} {}", question.version),
         Step::Start(run) => format!("start {task} {} (run {})", run.package.version, run.run),
         Step::Stop(_) => format!("stop {task}"),

@@ -27,7 +27,7 @@ pub fn begin_step(record: &TaskRecord, step: &Step, start: u64, at: &Moment<'_>)
         | Step::PullManifest(_)
         | Step::ProbeRos(_)
         | Step::PullContent { .. }
-        | Step::Build(_) => preparation::begin(record.preparation_mut(), step),
+        | Step::Build { .. } => preparation::begin(record.preparation_mut(), step),
         Step::QueryGate(question) => gate::begin(&mut record.gate, question),
         Step::Start(run) => process::begin_start(record, run, start, at),
         Step::Remove => record.collections.clear(),
@@ -49,7 +49,7 @@ pub fn finish_step(
         | Step::PullManifest(package)
         | Step::ProbeRos(package)
         | Step::PullContent { package, .. }
-        | Step::Build(package) => {
+        | Step::Build { package, .. } => {
             // A step for an order that was replaced meanwhile says nothing about the new order.
             if record.to_prepare().0 == package {
                 preparation::finish(record.preparation_mut(), outcome, kind, at);

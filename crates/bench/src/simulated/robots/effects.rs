@@ -18,7 +18,7 @@ use task_agent::transfer::parts::PartRequest;
 use task_proto::desired::{BlobRef, DesiredState, PackageRef};
 use task_proto::messages::report::{HostFacts, Progress};
 use task_proto::packages::manifest::TaskKind;
-use task_proto::{Digest, TaskName};
+use task_proto::{DeploymentId, Digest, TaskName};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
@@ -174,7 +174,12 @@ impl Effects for SimulatedEffects {
         self.robot.gather_content(package, progress, part_requests, cancel).await
     }
 
-    async fn build(&self, _: &PackageRef, _: &CancellationToken) -> Result<(), StepFailure> {
+    async fn build(
+        &self,
+        _: &PackageRef,
+        _: &DeploymentId,
+        _: &CancellationToken,
+    ) -> Result<(), StepFailure> {
         Ok(())
     }
 

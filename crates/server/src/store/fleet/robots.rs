@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use sqlx::{AssertSqlSafe, Row as _};
 use task_proto::api::RobotTask;
 use task_proto::desired::settings::RobotSettings;
-use task_proto::desired::{BlobRef, Delivery, DesiredTask, Evidence, PackageRef};
+use task_proto::desired::{BlobRef, Delivery, DesiredTask, Evidence, PackageRef, RobotDescription};
 use task_proto::ids::Labels;
 use task_proto::messages::report::{Condition, HostFacts, LinkFacts, Phase, Report, TaskReport};
 use task_proto::{DeploymentId, Digest, Generation, MacAddress, RobotId, RobotName, TaskName};
@@ -75,10 +75,15 @@ pub struct DesiredTasks {
     /// back to if they do not get ready.
     pub evidence: Evidence,
     pub settings: RobotSettings,
+    pub description: RobotDescription,
 }
 
 pub(in crate::store) const KNOWN: &str =
     "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL";
+
+/// A robot's generation after a change of its name or labels.
+const NEXT_WITH_LABELS: &str =
+    "generation + CASE WHEN generation > 0 AND observed_generation <= generation THEN 1 ELSE 0 END";
 
 const KNOWN_BY_ID_OR_NAME: &str = "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL AND (id = $1 OR name = $1)";
 
@@ -193,7 +198,7 @@ impl Robots<&Store> {
         for group in groups(robots) {
             // One statement, so that generation and tasks belong together.
             let sql = format!(
-                "SELECT r.id, r.generation, r.observed_generation, r.settings, a.task, a.deployment_id, a.wanted, a.run, d.package,
+                "SELECT r.id, r.name, r.labels, r.generation, r.observed_generation, r.settings, a.task, a.deployment_id, a.wanted, a.run, d.package,
                      a.ran, a.phase, COALESCE(a.mechanism, d.delivery) AS mechanism, d.priority
                  FROM robots r
                  LEFT JOIN assignments a ON a.robot_id = r.id AND a.desired = 1
@@ -219,6 +224,10 @@ impl Robots<&Store> {
                         bundled_blobs: Vec::new(),
                         evidence: Evidence::default(),
                         settings: settings(&row)?.unwrap_or_default(),
+                        description: RobotDescription {
+                            name: Some(id("robots.name", row.try_get("name")?)?),
+                            labels: from_json("robots.labels", row.try_get("labels")?)?,
+                        },
                     });
                 }
                 if let (Some(last), Some(task)) = (found.last_mut(), desired_task(&row)?) {
@@ -291,9 +300,14 @@ impl Robots<&mut Transaction> {
         self.index_labels(&[robot]).await
     }
 
-    /// Stores a robot's name and labels.
+    /// Stores a robot's name and labels. They are part of the desired state, so a change raises its
+    /// generation, except before the first order and for a diverged robot: its tasks are unknown
+    /// until the next order.
     pub async fn update(&mut self, robot: &KnownRobot) -> Result<(), StoreError> {
-        sqlx::query("UPDATE robots SET name = $2, labels = $3 WHERE id = $1")
+        let sql = format!(
+            "UPDATE robots SET name = $2, labels = $3, generation = {NEXT_WITH_LABELS} WHERE id = $1"
+        );
+        sqlx::query(AssertSqlSafe(sql))
             .bind(robot.id.as_str())
             .bind(robot.name.as_str())
             .bind(json(&robot.labels))
@@ -340,11 +354,11 @@ impl Robots<&mut Transaction> {
         Ok(())
     }
 
-    /// Stores these robots' labels.
+    /// Stores these robots' labels, which are other ones than before, as [`Self::update`] does.
     pub async fn update_labels(&mut self, robots: &[&KnownRobot]) -> Result<(), StoreError> {
         for group in groups(robots) {
             let sql = format!(
-                "WITH v (id, labels) AS ({}) UPDATE robots SET labels = v.labels FROM v WHERE robots.id = v.id",
+                "WITH v (id, labels) AS ({}) UPDATE robots SET labels = v.labels, generation = {NEXT_WITH_LABELS} FROM v WHERE robots.id = v.id",
                 values(1, group.len(), &["TEXT", "TEXT"])
             );
             let mut query = sqlx::query(AssertSqlSafe(sql));

@@ -292,6 +292,7 @@ impl Effects for Fake {
     async fn build(
         &self,
         _package: &PackageRef,
+        _deployment: &DeploymentId,
         _cancel: &CancellationToken,
     ) -> Result<(), StepFailure> {
         Ok(())

@@ -294,7 +294,7 @@ impl World {
         let new = match &step {
             Step::PullManifest(package)
             | Step::PullContent { package, .. }
-            | Step::Build(package) => Some(package),
+            | Step::Build { package, .. } => Some(package),
             Step::Start(run)
                 if record.active.as_ref().is_none_or(|active| !active.is_same(run)) =>
             {
@@ -462,7 +462,7 @@ impl World {
                 assert!(!same, "it still writes");
             }
             Step::PullContent { package, .. } => self.raise(package, 2),
-            Step::Build(package) => self.raise(package, 3),
+            Step::Build { package, .. } => self.raise(package, 3),
             Step::Start(run) if self.level(&run.package) < 3 => {
                 self.steps.retain(|(other, _)| *other != step);
                 self.refuse_start(&step);

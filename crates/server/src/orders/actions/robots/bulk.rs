@@ -68,6 +68,7 @@ impl RobotActions {
         let answer: Vec<SelectedRobot> = robots.iter().cloned().map(matched).collect();
         store_answer(&mut write, by, key, &request, &answer, now_ms).await?;
         write.commit().await?;
+        self.changes.notify_robots(changed.iter().map(|robot| robot.id.clone()));
         for robot in changed {
             self.changes.announce(Change::Robot(robot.id.clone()));
         }

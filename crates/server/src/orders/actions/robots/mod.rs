@@ -112,6 +112,7 @@ impl RobotActions {
         let mut write = self.store.begin().await?;
         let mut known = known_robot(&mut write, robot.as_str()).await?;
         check_scope(by, std::slice::from_ref(&known), || known.name.to_string())?;
+        let before = known.clone();
         let event = AuditEvent::by(by, AuditAction::RobotEdit, &known.id).with("name", &known.name);
         if let Some(labels) = &edit.labels {
             check_labels(labels)?;
@@ -124,7 +125,10 @@ impl RobotActions {
         check_scope(by, std::slice::from_ref(&known), || {
             format!("{} with the new name and labels", known.name)
         })?;
-        write.robots().update(&known).await?;
+        let is_described_anew = known != before;
+        if is_described_anew {
+            write.robots().update(&known).await?;
+        }
         let now_ms = self.clock.now_ms();
         let is_set = match &edit.settings {
             Some(settings) => {
@@ -142,7 +146,7 @@ impl RobotActions {
             .with_some("settings", settings);
         write.audit().record(&event, now_ms).await?;
         write.commit().await?;
-        if is_set {
+        if is_set || is_described_anew {
             self.changes.notify_robots([known.id.clone()]);
         }
         self.changes.announce(Change::Robot(known.id));

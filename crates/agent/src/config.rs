@@ -4,8 +4,13 @@
 //! The environment overrides the file, and the file overrides the defaults. Unknown keys are
 //! refused by name.
 
+mod check;
+mod reference;
 pub mod settings;
 pub mod trust;
+
+pub use self::check::check_file;
+pub use self::reference::reference;
 
 use std::collections::BTreeSet;
 use std::ffi::OsString;
@@ -42,8 +47,10 @@ const MIN_TASK_UID: u32 = 1000;
 const VARIABLE_PREFIX: &str = "TASK_AGENT_";
 /// The variable by which ROS 2 itself knows its domain; `ros_domain_id` overrides it.
 const ROS_DOMAIN_ID: &str = "ROS_DOMAIN_ID";
-/// Variables that are no settings: the data directory, the log filter, the enrollment token.
-const OTHER_VARIABLES: [&str; 3] = ["TASK_AGENT_DATA", "TASK_AGENT_LOG", "TASK_AGENT_ENROLL_TOKEN"];
+/// Variables that are no settings: the data directory, filter and form of the log, the enrollment
+/// token.
+const OTHER_VARIABLES: [&str; 4] =
+    ["TASK_AGENT_DATA", "TASK_AGENT_LOG", "TASK_AGENT_LOG_FORMAT", "TASK_AGENT_ENROLL_TOKEN"];
 
 /// The property file. An absent key has its default.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -315,8 +322,15 @@ impl Config {
         data_dir: &Path,
         variables: impl Iterator<Item = (OsString, OsString)>,
     ) -> Result<Self, ConfigError> {
-        let path = data_dir.join(FILE_NAME);
-        let mut table = read_table(&path)?;
+        Self::load_file(&data_dir.join(FILE_NAME), variables)
+    }
+
+    /// The settings of the file at `path` under `variables`.
+    fn load_file(
+        path: &Path,
+        variables: impl Iterator<Item = (OsString, OsString)>,
+    ) -> Result<Self, ConfigError> {
+        let mut table = read_table(path)?;
         // The file is checked first, alone, so that an error names its path.
         let _: Settings = deserialize(table.clone(), &path.display().to_string())?;
         let mut ros_domain_id = None;

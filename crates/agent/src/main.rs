@@ -21,6 +21,9 @@ enum Command {
     Enroll(commands::enroll::Arguments),
     /// Prompt for this robot's settings and write them to agent.toml
     Configure(commands::configure::Arguments),
+    /// Check a property file, and list all keys
+    #[command(subcommand)]
+    Config(commands::config::ConfigCommand),
     /// Run the agent until SIGINT or SIGTERM; tasks keep running afterwards
     Run(commands::run::Arguments),
     /// Show the state of this robot's tasks; works without a server or a running agent
@@ -49,6 +52,7 @@ fn main() -> ExitCode {
     let outcome = match CommandLine::parse().command {
         Command::Enroll(arguments) => commands::enroll::run(arguments),
         Command::Configure(arguments) => commands::configure::run(arguments),
+        Command::Config(command) => commands::config::run(command),
         Command::Run(arguments) => commands::run::run(arguments),
         Command::Status(arguments) => commands::status::run(arguments),
         Command::Hold(arguments) => commands::hold::hold(arguments),

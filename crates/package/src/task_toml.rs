@@ -9,6 +9,7 @@ use task_proto::expected::in_file_terms;
 use task_proto::packages::manifest::{
     BuildTool, Limits, Outputs, Ready, ReadyTopic, Requires, Run,
 };
+use task_proto::toml_keys::{KeyReference, closest_key, reference_table};
 use task_proto::{TaskName, Version};
 
 use super::Problem;
@@ -37,6 +38,53 @@ pub struct TaskToml {
     pub requires: Requires,
     /// `[limits]`: the resource limits of the task.
     pub limits: Limits,
+}
+
+/// All keys: key, default, meaning.
+const KEYS: [(&str, &str, &str); 28] = [
+    ("name", "<name> of package.xml", "Name of the package and its task"),
+    ("version", "<version> of package.xml", "Version of the package"),
+    ("build.tool", "by package.xml", "`colcon`, `catkin` or `none`"),
+    ("run.launch", "", "`[\"package\", \"file.launch.py\"]`; this or `run.exec` is required"),
+    ("run.exec", "", "A command and its arguments"),
+    ("run.args", "{}", "Launch arguments by name"),
+    ("run.env", "{}", "Environment variables of the task, which win over those of ROS setup files"),
+    ("run.kind", "\"service\"", "`service` keeps running, `job` runs to its end"),
+    ("run.on_boot", "\"start\"", "After a reboot: `start` or `hold`"),
+    (
+        "run.restart",
+        "\"on-failure\"",
+        "Restart after an end by itself: `on-failure`, `always` or `never`",
+    ),
+    ("run.idempotent", "false", "Whether an interrupted job may be started again"),
+    ("run.stop_timeout_s", "10", "Seconds from SIGINT to SIGTERM, and again to SIGKILL; 1 to 600"),
+    ("run.deadline_s", "", "Seconds that a job may run, at most 30 days"),
+    ("ready.nodes", "[]", "Nodes that must be on the ROS graph"),
+    ("ready.lifecycle", "[]", "Lifecycle nodes, which the agent brings to active"),
+    ("ready.services", "[]", "Services that must answer"),
+    ("ready.topics", "{}", "Topics that must be published, by name"),
+    ("ready.topics.NAME.min_hz", "", "Lowest rate of the topic"),
+    ("ready.hold_s", "2", "Seconds that the conditions must hold"),
+    ("ready.timeout_s", "30", "Seconds within which the task must become ready; 1 to 3600"),
+    (
+        "parameters.NODE.NAME",
+        "",
+        "ROS parameter of a node: boolean, number, string or list of one of these",
+    ),
+    ("outputs.paths", "[]", "Globs of files to upload when the task ends"),
+    ("requires.labels", "{}", "Labels that the robot must have"),
+    ("requires.ros_distro", "[]", "ROS distributions, one of which the robot must have"),
+    ("requires.arch", "[]", "Architectures, one of which the robot must have"),
+    ("limits.memory_mb", "the robot's", "Memory of all the task's processes, in MiB"),
+    ("limits.cpu_weight", "100", "CPU weight under contention, 1 to 10,000"),
+    ("limits.pids", "the robot's", "Number of processes and threads"),
+];
+
+/// All keys of `task.toml`, in Markdown.
+pub fn reference() -> String {
+    let keys =
+        KEYS.map(|(key, default, meaning)| KeyReference { key, variable: None, default, meaning });
+    reference_table(&keys)
 }
 
 /// Parses `text`, adding errors to `problems`.
@@ -197,7 +245,7 @@ impl Section<'_> {
 
     fn finish(&mut self) {
         for (key, _) in std::mem::take(&mut self.table) {
-            let hint = match closest_key(&key, &self.known) {
+            let hint = match closest_key(&key, self.known.iter().copied()) {
                 Some(known) => format!(" (did you mean {}{known}?)", self.path),
                 None => format!(" (expected one of: {})", self.known.join(", ")),
             };
@@ -244,31 +292,10 @@ fn truncated(value: &toml::Value) -> String {
     }
 }
 
-/// The known key closest to `key`: at most two letters away, and not all of them.
-fn closest_key<'k>(key: &str, known: &[&'k str]) -> Option<&'k str> {
-    let (distance, best) =
-        known.iter().map(|candidate| (edit_distance(key, candidate), *candidate)).min()?;
-    (distance <= 2 && distance < best.len()).then_some(best)
-}
-
-/// Number of insertions, deletions and substitutions (Levenshtein distance).
-fn edit_distance(from: &str, to: &str) -> usize {
-    let to: Vec<char> = to.chars().collect();
-    let mut row: Vec<usize> = (0..=to.len()).collect();
-    for (i, a) in from.chars().take(64).enumerate() {
-        let mut diagonal = row[0];
-        row[0] = i + 1;
-        for (j, b) in to.iter().enumerate() {
-            let changed = diagonal + usize::from(a != *b);
-            diagonal = row[j + 1];
-            row[j + 1] = changed.min(row[j] + 1).min(diagonal + 1);
-        }
-    }
-    row[to.len()]
-}
-
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeSet;
+
     use task_proto::packages::manifest::{OnBoot, Restart, TaskKind};
 
     use super::*;
@@ -329,6 +356,34 @@ mod tests {
         assert_eq!(file.parameters["/mapper"]["resolution"], serde_json::json!(0.05));
         assert_eq!(file.parameters["/mapper"]["frames"], serde_json::json!(["map", "odom"]));
         assert_eq!(file.requires.labels.len(), 1);
+    }
+
+    #[test]
+    fn reference_has_every_key_with_its_default() {
+        // Each section lists its keys when it meets an unknown one.
+        let text = "zzzzzz = 1\n[build]\nzzzzzz = 1\n[run]\nzzzzzz = 1\n[ready]\nzzzzzz = 1\n[outputs]\nzzzzzz = 1\n\
+                    [requires]\nzzzzzz = 1\n[limits]\nzzzzzz = 1\n[ready.topics.\"/t\"]\nzzzzzz = 1\n";
+        let mut known = BTreeSet::new();
+        for problem in problems(text) {
+            let (at, rest) = problem.split_once("zzzzzz: unknown key").expect("unknown");
+            let table = at.trim_start_matches("task.toml: ").replace("\"/t\"", "NAME");
+            let keys = rest.split_once("one of: ").expect("a list").1.trim_end_matches(')');
+            known.extend(keys.split(", ").map(|key| format!("{table}{key}")));
+        }
+        let tables = ["build", "run", "ready", "outputs", "requires", "limits", "parameters"];
+        known.retain(|key| !tables.contains(&key.as_str()));
+        known.insert("parameters.NODE.NAME".to_owned());
+        assert_eq!(known, KEYS.iter().map(|(key, ..)| (*key).to_owned()).collect());
+        let literal = |default: &str| format!("x = {default}").parse::<toml::Table>().is_ok();
+        let defaults: String = KEYS
+            .iter()
+            // Tasks without a weight have that of the kernel.
+            .filter(|(key, default, _)| literal(default) && *key != "limits.cpu_weight")
+            .map(|(key, default, _)| format!("{key} = {default}\n"))
+            .collect();
+        let mut problems = Vec::new();
+        assert_eq!(parse(&defaults, &mut problems), TaskToml::default(), "{defaults}");
+        assert_eq!(problems, []);
     }
 
     #[test]

@@ -21,5 +21,5 @@ pub use ids::{
     AbsolutePath, DeploymentId, Generation, InstanceId, MacAddress, RepositoryName, RobotId,
     RobotName, Tag, TaskName, TokenId, UserName, Version,
 };
-pub use text::{error_chain, expected, line, size, time};
+pub use text::{error_chain, expected, line, log_format, size, time, toml_keys};
 pub use trust::pin::CaPin;

@@ -1,12 +1,16 @@
 //! The `taskd` binary: parses the command line and hands over. It never holds logic of its own.
 
+use std::fs::File;
 use std::io::{IsTerminal as _, Write as _};
+use std::os::fd::AsFd as _;
+use std::os::unix::fs::MetadataExt as _;
 use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::Context as _;
 use nix::sys::stat::{Mode, umask};
 use task_proto::line::SingleLineWriter;
+use task_proto::log_format::LogFormat;
 use taskd::config::{Config, ConfigError, ServeFlags};
 use taskd::net::open_files;
 use taskd::serve::Server;
@@ -50,6 +54,11 @@ fn main() -> ExitCode {
         Command::Serve(flags) => {
             runtime.block_on(serve(&flags)).unwrap_or_else(|error| report_error(&error))
         }
+        Command::Config(command) => match command.run() {
+            Ok(true) => ExitCode::SUCCESS,
+            Ok(false) => task_cli::Outcome::Usage.into(),
+            Err(error) => report_error(&error.into()),
+        },
         Command::Database(command) => match runtime.block_on(command.run()) {
             Ok(()) => ExitCode::SUCCESS,
             Err(error) => report_error(&error.into()),
@@ -80,20 +89,12 @@ fn make_files_private() {
 
 async fn serve(flags: &ServeFlags) -> anyhow::Result<ExitCode> {
     make_files_private();
-    let filter = EnvFilter::try_from_env("TASKD_LOG")
-        .unwrap_or_else(|_| EnvFilter::new("info,sqlx=warn,rumqttd=error"));
-    let (limits, has_colours) = (LogLimits::default(), std::io::stderr().is_terminal());
-    tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        .with_writer(move || SingleLineWriter::new(std::io::stderr(), has_colours))
-        .with_ansi(has_colours)
-        .finish()
-        .with(limits.clone())
-        .init();
+    let mut config = Config::load(flags, std::env::vars_os())?;
+    let limits = LogLimits::default();
+    start_logging(config.log_format, &limits);
     let stop = CancellationToken::new();
     let _stopped = stop.clone().drop_guard();
     tokio::spawn(limits.run(stop));
-    let mut config = Config::load(flags, std::env::vars_os())?;
     match open_files::raise() {
         Ok(allowed) => open_files::fit(&mut config, allowed)?,
         Err(error) => tracing::warn!(%error, "the limit on open files can't be raised"),
@@ -128,6 +129,26 @@ async fn serve(flags: &ServeFlags) -> anyhow::Result<ExitCode> {
     tokio::select! {
         () = stopping => Ok(code),
         () = signals.next() => Ok(ExitCode::FAILURE),
+    }
+}
+
+/// Logs to stderr, as lines for people or as JSON.
+fn start_logging(format: LogFormat, limits: &LogLimits) {
+    let filter = EnvFilter::try_from_env("TASKD_LOG")
+        .unwrap_or_else(|_| EnvFilter::new("info,sqlx=warn,rumqttd=error"));
+    let stream = std::io::stderr().as_fd().try_clone_to_owned().map(File::from);
+    let stream = stream.and_then(|stream| stream.metadata()).ok();
+    let stream = stream.map(|stream| (stream.dev(), stream.ino()));
+    let is_json = format.is_json(std::env::var("JOURNAL_STREAM").ok().as_deref(), stream);
+    let has_colours = !is_json && std::io::stderr().is_terminal();
+    let log = tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(move || SingleLineWriter::new(std::io::stderr(), has_colours))
+        .with_ansi(has_colours);
+    if is_json {
+        log.json().with_current_span(false).finish().with(limits.clone()).init();
+    } else {
+        log.finish().with(limits.clone()).init();
     }
 }
 

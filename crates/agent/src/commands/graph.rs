@@ -1,13 +1,12 @@
 //! `task-agent graph`: takes part in the ROS graph for an agent. Only the agent calls it.
 
-use std::io::IsTerminal as _;
 use std::os::fd::{AsFd as _, BorrowedFd};
 use std::process::ExitCode;
 
 use anyhow::Context as _;
-use task_proto::line::SingleLineWriter;
 use tokio::net::unix::pipe;
 
+use super::start_logging;
 use crate::process::confinement;
 use crate::ros::graph::process::serve;
 
@@ -16,7 +15,7 @@ const MAX_BLOCKING_THREADS: usize = 2;
 
 /// Executes requests from standard input until its end.
 pub fn run() -> anyhow::Result<ExitCode> {
-    start_logging();
+    start_logging("warn,rustdds=off")?;
     confinement::hide_this_process();
     let runtime = tokio::runtime::Builder::new_current_thread()
         .max_blocking_threads(MAX_BLOCKING_THREADS)
@@ -38,13 +37,4 @@ pub fn run() -> anyhow::Result<ExitCode> {
 
 fn owned(stream: BorrowedFd<'_>) -> anyhow::Result<std::os::fd::OwnedFd> {
     stream.try_clone_to_owned().context("cannot use the pipes to the agent")
-}
-
-/// Limits the logging: untrusted messages must not cause one line each.
-fn start_logging() {
-    let filter = tracing_subscriber::EnvFilter::try_from_env("TASK_AGENT_LOG")
-        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn,rustdds=off"));
-    let colours = std::io::stderr().is_terminal();
-    let writer = move || SingleLineWriter::new(std::io::stderr(), colours);
-    tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colours).with_writer(writer).init();
 }

@@ -1,17 +1,25 @@
 //! The subcommands of `task-agent`: each turns its arguments into one call and the outcome into an
 //! exit code. Only they and `main` use `anyhow` and print.
 
+use std::fs::File;
+use std::io::IsTerminal as _;
+use std::os::fd::AsFd as _;
+use std::os::unix::fs::MetadataExt as _;
 use std::path::PathBuf;
 
-use anyhow::ensure;
+use anyhow::{anyhow, ensure};
 use clap::ValueEnum;
 use rustls::ClientConfig;
 use task_proto::CaPin;
+use task_proto::line::SingleLineWriter;
+use task_proto::log_format::LogFormat;
 use task_transport::{ClientKey, Trust};
+use tracing_subscriber::EnvFilter;
 
 use crate::system::clock;
 
 mod approval;
+pub mod config;
 pub mod configure;
 pub mod doctor;
 pub mod enroll;
@@ -22,6 +30,8 @@ pub mod run;
 pub mod shim;
 pub mod status;
 
+/// The variable that chooses the form of the log.
+const LOG_FORMAT_VARIABLE: &str = "TASK_AGENT_LOG_FORMAT";
 /// Default directory of all data of a robot, overridden by `--data` or `TASK_AGENT_DATA`.
 pub const DEFAULT_DATA_DIR: &str = "/var/lib/task-agent";
 
@@ -40,6 +50,32 @@ enum Output {
     Table,
     /// One JSON document, for programs
     Json,
+}
+
+/// Logs to stderr: as JSON if stderr is systemd's journal, else as lines for people.
+/// `TASK_AGENT_LOG_FORMAT` chooses the form, `TASK_AGENT_LOG` filters, instead of `filter`.
+fn start_logging(filter: &str) -> anyhow::Result<()> {
+    let format = match std::env::var(LOG_FORMAT_VARIABLE) {
+        Ok(text) => text.parse().map_err(|reason| anyhow!("{LOG_FORMAT_VARIABLE}: {reason}"))?,
+        Err(_) => LogFormat::Auto,
+    };
+    let filter =
+        EnvFilter::try_from_env("TASK_AGENT_LOG").unwrap_or_else(|_| EnvFilter::new(filter));
+    let stream = std::io::stderr().as_fd().try_clone_to_owned().map(File::from);
+    let stream = stream.and_then(|stream| stream.metadata()).ok();
+    let stream = stream.map(|stream| (stream.dev(), stream.ino()));
+    let is_json = format.is_json(std::env::var("JOURNAL_STREAM").ok().as_deref(), stream);
+    let colours = !is_json && std::io::stderr().is_terminal();
+    let log = tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_ansi(colours)
+        .with_writer(move || SingleLineWriter::new(std::io::stderr(), colours));
+    if is_json {
+        log.json().with_current_span(false).init();
+    } else {
+        log.init();
+    }
+    Ok(())
 }
 
 /// Refuses plain text where the server is identified by a pin. `setting` is the source of the
@@ -72,6 +108,12 @@ fn tls(pin: Option<CaPin>, key: Option<&ClientKey>) -> anyhow::Result<ClientConf
 #[expect(clippy::print_stderr, reason = "this is where the binary reports its failure to a person")]
 pub fn print_error(error: &anyhow::Error) {
     eprintln!("task-agent: {error:#}");
+}
+
+/// Prints a line on stderr. A closed reader is no error.
+fn print_line_of_error(line: &str) {
+    use std::io::Write as _;
+    let _ = writeln!(std::io::stderr(), "{line}");
 }
 
 /// Prints a line on stdout. A closed reader is no error.

@@ -2,20 +2,18 @@
 //! afterwards; under systemd that needs `KillMode=process`.
 
 use std::fs::{File, OpenOptions, Permissions, TryLockError};
-use std::io::IsTerminal as _;
 use std::os::unix::fs::{OpenOptionsExt as _, PermissionsExt as _};
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context as _;
-use task_proto::line::SingleLineWriter;
 use task_proto::messages::report::Status;
 use task_proto::{Digest, InstanceId};
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
-use super::{DataDir, refuse_plain_text, tls};
+use super::{DataDir, refuse_plain_text, start_logging, tls};
 use crate::config::{Config, parse_server};
 use crate::install::fetch::{FetchSettings, Fetcher};
 use crate::link::endpoint;
@@ -58,7 +56,7 @@ pub struct Arguments {
 
 /// Runs the agent until SIGINT or SIGTERM.
 pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
-    start_logging();
+    start_logging("info,rumqttc=warn,rustdds=error")?;
     if let Some(status) = program::collect_orphans_as_init().context("cannot start as process 1")? {
         return Ok(ExitCode::from(status.as_shell_code()));
     }
@@ -251,14 +249,6 @@ fn start_mqtt(
         server_messages,
         MqttChannels { requests, messages: said, lines },
     ));
-}
-
-fn start_logging() {
-    let filter = tracing_subscriber::EnvFilter::try_from_env("TASK_AGENT_LOG")
-        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info,rumqttc=warn,rustdds=error"));
-    let colours = std::io::stderr().is_terminal();
-    let writer = move || SingleLineWriter::new(std::io::stderr(), colours);
-    tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colours).with_writer(writer).init();
 }
 
 /// Prevents a second agent from using the data directory while this one lives. Only this user may

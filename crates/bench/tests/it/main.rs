@@ -8,6 +8,7 @@ mod cluster;
 mod cluster_forward;
 mod cluster_nodes;
 mod cluster_scenario;
+mod configuration;
 mod confinement;
 mod corridor;
 mod crash;

@@ -4,8 +4,10 @@
 //! names every setting, so the sources can't drift apart. This module also reads the file and
 //! resolves host names.
 
+mod check;
 mod cluster;
 mod oidc;
+mod reference;
 mod settings;
 mod tables;
 mod tls;
@@ -19,12 +21,15 @@ use clap::{Arg, ArgAction, ArgMatches};
 use task_proto::CaPin;
 use task_proto::data_directory::default_data_directory;
 use task_proto::ids::LabelKey;
+use task_proto::log_format::LogFormat;
 use task_proto::messages::part::DEFAULT_PART_BYTES;
 use task_proto::messages::topic::TopicPrefix;
+use task_proto::toml_keys::{closest_key, line_of};
 
 use self::cluster::ClusterDraft;
 pub use self::cluster::{Bus, ClusterSettings};
 pub use self::oidc::{OidcSettings, RoleRule, private_url};
+pub use self::reference::reference;
 use self::settings::{SETTINGS, Setting};
 pub use self::tables::{PersonRates, SiteLimits, TransferLimits};
 pub use self::tls::TlsSettings;
@@ -39,6 +44,8 @@ use crate::domain::limits::robot_limiter::RobotLimits;
 pub struct Config {
     /// The directory that holds all state.
     pub data: PathBuf,
+    /// The form of the server's log.
+    pub log_format: LogFormat,
     /// The HTTP listener's address; port 0 picks a free port.
     pub http: SocketAddr,
     /// The MQTT listener's address; port 0 picks a free port.
@@ -219,12 +226,8 @@ pub enum ConfigError {
         source: std::io::Error,
     },
     /// The file is not TOML.
-    #[error("{} is not valid TOML: {reason}", path.display())]
-    Syntax {
-        path: PathBuf,
-        /// The position and the error.
-        reason: String,
-    },
+    #[error("{} is not valid TOML: {}{reason}", path.display(), line.map(|line| format!("line {line}: ")).unwrap_or_default())]
+    Syntax { path: PathBuf, line: Option<usize>, reason: String },
     /// No data directory is given and there is no home directory for the default.
     #[error("--data: no directory is given, and neither XDG_DATA_HOME nor HOME is set")]
     NoDataDirectory,
@@ -305,6 +308,7 @@ impl Config {
         const DAY: Duration = Duration::from_secs(24 * 60 * 60);
         Self {
             data,
+            log_format: LogFormat::Auto,
             http: SocketAddr::from(([127, 0, 0, 1], 8080)),
             mqtt: SocketAddr::from(([127, 0, 0, 1], 1883)),
             broker: None,
@@ -360,7 +364,8 @@ impl Config {
         let mut config = Self::with_data(PathBuf::new());
         let file = flags.config.clone().or_else(|| variable("TASKD_CONFIG").map(PathBuf::from));
         if let Some(path) = &file {
-            config.apply_file(path)?;
+            let (_, table) = read_file(path)?;
+            config.apply_file(path, table).into_iter().next().map_or(Ok(()), Err)?;
         }
         config.apply_environment(&environment)?;
         for (name, text) in &flags.settings {
@@ -456,34 +461,21 @@ impl Config {
         (setting.set)(self, text).map_err(|reason| ConfigError::Value { origin, reason })
     }
 
-    fn apply_file(&mut self, path: &Path) -> Result<(), ConfigError> {
-        let unreadable = |source| ConfigError::Unreadable { path: path.to_owned(), source };
-        let syntax = |reason| ConfigError::Syntax { path: path.to_owned(), reason };
-        if std::fs::metadata(path).map_err(unreadable)?.len() > MAX_FILE_BYTES {
-            return Err(syntax(format!("it has more than {MAX_FILE_BYTES} bytes")));
-        }
-        let text = std::fs::read_to_string(path).map_err(unreadable)?;
-        let table: toml::Table = text.parse().map_err(|error: toml::de::Error| {
-            // The line itself is left out, because it may contain a password.
-            let line = error
-                .span()
-                .map(|span| text[..span.start.min(text.len())].matches('\n').count() + 1);
-            let line = line.map(|line| format!("line {line}: ")).unwrap_or_default();
-            syntax(format!("{line}{}", error.message()))
-        })?;
+    /// Applies the keys of a file. Returns the errors of all keys.
+    fn apply_file(&mut self, path: &Path, table: toml::Table) -> Vec<ConfigError> {
+        let mut errors = Vec::new();
         for (key, value) in table {
             match value {
                 toml::Value::Table(table) if tables::is_known(&key) => {
-                    self.apply_table(path, &key, table)?
+                    self.apply_table(path, &key, table, &mut errors)
                 }
-                value => self.apply_value(
-                    &key,
-                    value,
-                    Origin::File { key: key.clone(), path: path.to_owned() },
-                )?,
+                value => {
+                    let origin = Origin::File { key: key.clone(), path: path.to_owned() };
+                    errors.extend(self.apply_value(&key, value, origin).err());
+                }
             }
         }
-        Ok(())
+        errors
     }
 
     /// Applies a setting from a file. `key` is the full name, `origin` the place in the file.
@@ -594,8 +586,28 @@ impl clap::FromArgMatches for ServeFlags {
     }
 }
 
-/// A suggestion for a mistyped key: the setting that shares its first letters or contains the key.
+/// The content of a configuration file, and its keys.
+fn read_file(path: &Path) -> Result<(String, toml::Table), ConfigError> {
+    let unreadable = |source| ConfigError::Unreadable { path: path.to_owned(), source };
+    let syntax = |line, reason| ConfigError::Syntax { path: path.to_owned(), line, reason };
+    if std::fs::metadata(path).map_err(unreadable)?.len() > MAX_FILE_BYTES {
+        return Err(syntax(None, format!("it has more than {MAX_FILE_BYTES} bytes")));
+    }
+    let text = std::fs::read_to_string(path).map_err(unreadable)?;
+    let table = text.parse().map_err(|error: toml::de::Error| {
+        // The line itself is left out, because it may contain a password.
+        let line = error.span().map(|span| line_of(&text, span.start));
+        syntax(line, error.message().to_owned())
+    })?;
+    Ok((text, table))
+}
+
+/// A suggestion for a mistyped key: the closest setting, else the one that shares its first letters.
 fn suggestion(key: &str) -> String {
+    let keys: Vec<String> = SETTINGS.iter().map(Setting::key).collect();
+    if let Some(best) = closest_key(key, keys.iter().map(String::as_str)) {
+        return format!("; did you mean {best}?");
+    }
     let shared = |other: &str| key.bytes().zip(other.bytes()).take_while(|(a, b)| a == b).count();
     let best = SETTINGS.iter().map(Setting::key).max_by_key(|other| shared(other));
     match best {

@@ -44,6 +44,13 @@ pub(super) const SETTINGS: &[Setting] = &[
         },
     },
     Setting {
+        name: "log-format",
+        value_name: "auto|text|json",
+        help: "Form of the log on stderr: lines for people, or JSON, which \"auto\" chooses if stderr is systemd's \
+               journal; TASKD_LOG filters it [default: auto]",
+        set: |config, text| parsed(text).map(|format| config.log_format = format),
+    },
+    Setting {
         name: "http",
         value_name: "ADDR",
         help: "Address of the HTTP listener; port 0 picks a free port [default: 127.0.0.1:8080]",

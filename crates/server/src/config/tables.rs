@@ -65,29 +65,24 @@ impl SiteLimits {
     }
 }
 
+/// The tables that the file may have.
+pub(super) const TABLES: [&str; 9] =
+    ["blobs", "cluster", "delivery", "enrolment", "oidc", "people", "robots", "tls", "transfers"];
+
 /// Whether the file may have a table of this name.
 pub(super) fn is_known(name: &str) -> bool {
-    matches!(
-        name,
-        "blobs"
-            | "cluster"
-            | "delivery"
-            | "enrolment"
-            | "oidc"
-            | "people"
-            | "robots"
-            | "tls"
-            | "transfers"
-    )
+    TABLES.contains(&name)
 }
 
 impl Config {
+    /// Applies the keys of a table, and adds their errors to `errors`.
     pub(super) fn apply_table(
         &mut self,
         path: &Path,
         name: &str,
         table: toml::Table,
-    ) -> Result<(), ConfigError> {
+        errors: &mut Vec<ConfigError>,
+    ) {
         let origin =
             |key: String| Origin::File { key: format!("{name}.{key}"), path: path.to_owned() };
         if name == "cluster" {
@@ -101,22 +96,20 @@ impl Config {
                 ("oidc", "rules") => oidc::rules(value).map(|rules| self.oidc.rules = rules),
                 ("transfers", "sites") => sites(value).map(|sites| self.transfers.sites = sites),
                 _ if Setting::by_key(&setting).is_none() => {
-                    return Err(ConfigError::Unknown {
-                        hint: suggestion(&setting),
-                        origin: origin(key),
-                    });
+                    let hint = suggestion(&setting);
+                    errors.push(ConfigError::Unknown { hint, origin: origin(key) });
+                    continue;
                 }
                 _ => {
-                    self.apply_value(&setting, value, origin(key))?;
+                    errors.extend(self.apply_value(&setting, value, origin(key)).err());
                     continue;
                 }
             };
-            read.map_err(|error| ConfigError::Value {
+            errors.extend(read.err().map(|error| ConfigError::Value {
                 origin: origin(error.key),
                 reason: error.reason,
-            })?;
+            }));
         }
-        Ok(())
     }
 }
 

@@ -2,6 +2,7 @@
 //! server that they need, and the commands about the database and the blobs of a stopped server.
 
 mod blobs;
+mod config;
 mod database;
 mod doctor;
 
@@ -12,6 +13,7 @@ use clap::parser::ValueSource;
 use clap::{CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 
 pub use self::blobs::{BlobsCommand, BlobsCommandError};
+pub use self::config::ConfigCommand;
 pub use self::database::DatabaseCommand;
 pub use self::doctor::check_server;
 use crate::config::ServeFlags;
@@ -36,6 +38,9 @@ pub enum Command {
     /// One of the operator's commands, of the crate `cli`.
     #[command(flatten)]
     Operator(task_cli::Command),
+    /// Check a configuration file, and list all keys
+    #[command(subcommand)]
+    Config(ConfigCommand),
     /// Copy the database of a stopped server
     #[command(subcommand)]
     Database(DatabaseCommand),

@@ -24,8 +24,8 @@ const MAX_THREADS: u64 = 64;
 const NICE: i32 = 5;
 /// Id of the user `nobody`, for robots without another account.
 const NOBODY: u32 = 65_534;
-/// The only variable that the program gets from the agent.
-const LOG_VARIABLE: &str = "TASK_AGENT_LOG";
+/// The only variables that the program gets from the agent: filter and form of its log.
+const LOG_VARIABLES: [&str; 3] = ["TASK_AGENT_LOG", "TASK_AGENT_LOG_FORMAT", "JOURNAL_STREAM"];
 
 /// Settings for starting the program.
 #[derive(Debug, Clone)]
@@ -70,10 +70,9 @@ impl GraphProgram {
         let limits = RunLimits { pids: None, ..limits };
         let confinement =
             Confinement::new(&self.path, group.as_ref(), &limits, self.account.as_ref())?;
-        let environment: BTreeMap<_, _> = std::env::var(LOG_VARIABLE)
-            .ok()
-            .map(|value| (LOG_VARIABLE.to_owned(), value))
-            .into_iter()
+        let environment: BTreeMap<_, _> = LOG_VARIABLES
+            .iter()
+            .filter_map(|name| Some(((*name).to_owned(), std::env::var(name).ok()?)))
             .collect();
         program::spawn_graph(&self.path, &environment, NICE, MEMORY_BYTES, confinement)
     }

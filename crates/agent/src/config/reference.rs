@@ -114,7 +114,9 @@ mod tests {
         };
         let error =
             toml::from_str::<Settings>(&format!("{head}zzzzzz = 1\n")).expect_err("unknown");
-        let names = error.message().split_once("one of ").expect("a list").1.to_owned();
+        // Of two keys: `a` or `b`; of more: one of `a`, `b`, `c`.
+        let (_, names) = error.message().split_once("expected ").expect("a list");
+        let names = names.trim_start_matches("one of ").replace(" or ", ", ");
         names.split(", ").map(|name| format!("{prefix}{}", name.trim_matches('`'))).collect()
     }
 

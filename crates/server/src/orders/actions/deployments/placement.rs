@@ -16,7 +16,7 @@ use crate::orders::rollout;
 use crate::store::{NewDeployment, OrderChunk, StillRunning, StoreError, Transaction};
 
 /// The most robots that one write places an order for.
-pub const CHUNK_ROBOTS: usize = 2_000;
+pub const CHUNK_ROBOTS: usize = 500;
 
 /// A package that is ordered on robots.
 pub(super) struct Placement<'a> {

@@ -48,10 +48,10 @@ fn problems(key: String, value: Value) -> Vec<(String, String)> {
             let names: Vec<String> = inner.keys().cloned().collect();
             let mut found = Vec::new();
             for name in names {
-                found.extend(unknown(&format!("{prefix}{name}")).map(|problem| {
+                if let Some(problem) = unknown(&format!("{prefix}{name}")) {
                     inner.remove(&name);
-                    problem
-                }));
+                    found.push(problem);
+                }
             }
             if JOINT_TABLES.contains(&key.as_str()) {
                 found.extend(problem(&key, Table::from_iter([(key.clone(), Value::Table(inner))])));

@@ -10,6 +10,8 @@ use super::{Client, TRY_TIMEOUT};
 /// The readers of a run.
 pub(super) const READERS: usize = 5;
 const AGAIN: Duration = Duration::from_millis(500);
+/// How an event of the feed begins.
+const FEED: &[u8] = br#"{"type":"feed""#;
 /// The longest line that is kept.
 const MAX_LINE_BYTES: usize = 1 << 20;
 
@@ -50,7 +52,12 @@ async fn read(client: &Client, server: usize, connection: usize) {
 
 /// The number of the feed's entry in a line of the stream, if it has one.
 fn feed_number(line: &[u8]) -> Option<u64> {
-    match serde_json::from_slice(line.strip_prefix(b"data:")?) {
+    // Other events are many and long.
+    let data = line.strip_prefix(b"data:")?.trim_ascii_start();
+    if !data.starts_with(FEED) {
+        return None;
+    }
+    match serde_json::from_slice(data) {
         Ok(Event::Feed { entry }) => Some(entry.number),
         _ => None,
     }

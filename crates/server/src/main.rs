@@ -1,9 +1,6 @@
 //! The `taskd` binary: parses the command line and hands over. It never holds logic of its own.
 
-use std::fs::File;
 use std::io::{IsTerminal as _, Write as _};
-use std::os::fd::AsFd as _;
-use std::os::unix::fs::MetadataExt as _;
 use std::process::ExitCode;
 use std::time::Duration;
 
@@ -136,10 +133,7 @@ async fn serve(flags: &ServeFlags) -> anyhow::Result<ExitCode> {
 fn start_logging(format: LogFormat, limits: &LogLimits) {
     let filter = EnvFilter::try_from_env("TASKD_LOG")
         .unwrap_or_else(|_| EnvFilter::new("info,sqlx=warn,rumqttd=error"));
-    let stream = std::io::stderr().as_fd().try_clone_to_owned().map(File::from);
-    let stream = stream.and_then(|stream| stream.metadata()).ok();
-    let stream = stream.map(|stream| (stream.dev(), stream.ino()));
-    let is_json = format.is_json(std::env::var("JOURNAL_STREAM").ok().as_deref(), stream);
+    let is_json = format.is_json_on_stderr();
     let has_colours = !is_json && std::io::stderr().is_terminal();
     let log = tracing_subscriber::fmt()
         .with_env_filter(filter)

@@ -1,10 +1,7 @@
 //! The subcommands of `task-agent`: each turns its arguments into one call and the outcome into an
 //! exit code. Only they and `main` use `anyhow` and print.
 
-use std::fs::File;
 use std::io::IsTerminal as _;
-use std::os::fd::AsFd as _;
-use std::os::unix::fs::MetadataExt as _;
 use std::path::PathBuf;
 
 use anyhow::{anyhow, ensure};
@@ -61,10 +58,7 @@ fn start_logging(filter: &str) -> anyhow::Result<()> {
     };
     let filter =
         EnvFilter::try_from_env("TASK_AGENT_LOG").unwrap_or_else(|_| EnvFilter::new(filter));
-    let stream = std::io::stderr().as_fd().try_clone_to_owned().map(File::from);
-    let stream = stream.and_then(|stream| stream.metadata()).ok();
-    let stream = stream.map(|stream| (stream.dev(), stream.ino()));
-    let is_json = format.is_json(std::env::var("JOURNAL_STREAM").ok().as_deref(), stream);
+    let is_json = format.is_json_on_stderr();
     let colours = !is_json && std::io::stderr().is_terminal();
     let log = tracing_subscriber::fmt()
         .with_env_filter(filter)

@@ -30,7 +30,7 @@ use crate::store::{
 use crate::system::clock::Clock;
 
 pub use placement::CHUNK_ROBOTS;
-use placement::{Placement, Room};
+use placement::{Placement, WriteBudget};
 pub use retry_rollback::Rollback;
 
 /// Orders about deployments, and about tasks that robots have. Clones share their state.
@@ -133,9 +133,9 @@ impl DeploymentActions {
         let placement =
             Placement { package: &package.package, kind, order, robots: &robots, expires_at_ms };
         let mut notifications = PendingNotifications::default();
-        let mut room = Room::of(self.chunk_robots);
+        let mut budget = WriteBudget::of(self.chunk_robots);
         let id = placement
-            .place(&mut write, &self.planner, &mut room, now_ms, &mut notifications)
+            .place(&mut write, &self.planner, &mut budget, now_ms, &mut notifications)
             .await?;
         let task = &package.package.name;
         let event = AuditEvent::by(by, AuditAction::DeploymentCreate, &id)

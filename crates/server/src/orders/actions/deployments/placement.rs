@@ -1,8 +1,7 @@
-//! Placing orders: every selected robot gets its part of the deployment. An order for few robots is
-//! placed in the write that makes it, a large one in chunks, so that no write keeps reports waiting
-//! for long. The rest of a large order is in the database; whichever server comes first places the
-//! next chunk, and finds out within its write which one that is. The cancel of a large deployment
-//! goes on in the same way.
+//! Placing orders: every selected robot gets its assignment. An order for few robots is placed in
+//! the write that makes it, a large one in chunks, so that no write keeps reports waiting for long.
+//! The rest of a large order is in the database. Any server places the next chunk, which it reads
+//! within the same write. The cancel of a large deployment goes on in the same way.
 
 use task_proto::api::CreateDeployment;
 use task_proto::desired::PackageRef;
@@ -29,14 +28,14 @@ pub(super) struct Placement<'a> {
 }
 
 /// How many robots a write may still place orders for.
-pub(super) struct Room {
+pub(super) struct WriteBudget {
     /// The most robots of one write.
     chunk: usize,
     left: usize,
 }
 
-/// Robots that get their parts of a deployment in one write.
-struct Part<'a> {
+/// Robots that got their assignments of a deployment in this write.
+struct PlacedRobots<'a> {
     deployment: &'a DeploymentId,
     task: &'a TaskName,
     restart: bool,
@@ -44,40 +43,40 @@ struct Part<'a> {
     robots: &'a [RobotId],
 }
 
-impl Room {
+impl WriteBudget {
     pub(super) fn of(chunk: usize) -> Self {
         Self { chunk, left: chunk }
     }
 }
 
 impl Placement<'_> {
-    /// Stores the deployment, places it for as many robots as there is room for, and keeps the rest
-    /// of the robots for later writes.
+    /// Stores the deployment, places it for as many robots as the budget allows, and stores the
+    /// rest of the robots for later writes.
     pub(super) async fn place(
         &self,
         write: &mut Transaction,
         planner: &DeliveryPlanner,
-        room: &mut Room,
+        budget: &mut WriteBudget,
         now_ms: u64,
         notifications: &mut PendingNotifications,
     ) -> Result<DeploymentId, StoreError> {
         let &Self { package, kind, order, robots, expires_at_ms } = self;
         let id = DeploymentId::random();
-        let (first, rest) = robots.split_at(robots.len().min(room.left));
-        room.left -= first.len();
+        let (first, rest) = robots.split_at(robots.len().min(budget.left));
+        budget.left -= first.len();
         let (selected, placed) = (robots.len() as u64, first.len() as u64);
         let new = NewDeployment { id: &id, package, kind, order, selected, placed, expires_at_ms };
         write.deployments().insert(&new, now_ms).await?;
-        write.order_chunks().insert(&id, first.len(), rest, room.chunk).await?;
+        write.order_chunks().insert(&id, first.len(), rest, budget.chunk).await?;
         let (task, restart) = (&package.name, order.restart);
-        let part = Part { deployment: &id, task, restart, first_place: 0, robots: first };
+        let placed = PlacedRobots { deployment: &id, task, restart, first_place: 0, robots: first };
         write.assignments().insert(&id, task, first, 0, now_ms).await?;
-        part.begin(write, planner, now_ms, notifications).await?;
+        placed.begin(write, planner, now_ms, notifications).await?;
         Ok(id)
     }
 }
 
-impl Part<'_> {
+impl PlacedRobots<'_> {
     /// Advances all deployments that may go on now that these robots have an assignment, including
     /// this one. Where the package runs already, nothing begins unless `restart` is set.
     async fn begin(
@@ -143,8 +142,8 @@ impl DeploymentActions {
         write.assignments().drop_from(deployment, first_place, dropped, now_ms).await?;
         write.assignments().yield_to_newer(chunk, now_ms).await?;
         let mut notifications = PendingNotifications::default();
-        let part = Part { deployment, task, restart, first_place, robots };
-        part.begin(write, &self.planner, now_ms, &mut notifications).await?;
+        let placed = PlacedRobots { deployment, task, restart, first_place, robots };
+        placed.begin(write, &self.planner, now_ms, &mut notifications).await?;
         Ok(notifications)
     }
 

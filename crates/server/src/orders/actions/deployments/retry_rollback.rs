@@ -10,7 +10,7 @@ use task_proto::packages::manifest::TaskKind;
 use task_proto::{DeploymentId, Digest, RobotId, TaskName};
 
 use super::tasks::robots_with_task;
-use super::{DeploymentActions, DeploymentError, Placement, Room};
+use super::{DeploymentActions, DeploymentError, Placement, WriteBudget};
 use crate::domain::person::Person;
 use crate::orders::actions::OrderError;
 use crate::orders::actions::idempotency::{
@@ -104,9 +104,9 @@ impl DeploymentActions {
             expires_at_ms,
         };
         let mut notifications = PendingNotifications::default();
-        let mut room = Room::of(self.chunk_robots);
+        let mut budget = WriteBudget::of(self.chunk_robots);
         let new = placement
-            .place(&mut write, &self.planner, &mut room, now_ms, &mut notifications)
+            .place(&mut write, &self.planner, &mut budget, now_ms, &mut notifications)
             .await?;
         let event = AuditEvent::by(by, AuditAction::DeploymentRetry, &new)
             .with("of", id)
@@ -155,8 +155,8 @@ impl DeploymentActions {
             return Err(DeploymentError::NothingToRollBack(task.clone()));
         }
         let expires_at_ms = now_ms + self.assignment_lifetime_ms;
-        let (mut room, mut notifications) =
-            (Room::of(self.chunk_robots), PendingNotifications::default());
+        let (mut budget, mut notifications) =
+            (WriteBudget::of(self.chunk_robots), PendingNotifications::default());
         for (package, kind, robots) in targets {
             let order =
                 CreateDeployment::new(task.clone(), package.manifest.digest, selector.clone());
@@ -168,7 +168,7 @@ impl DeploymentActions {
                 expires_at_ms,
             };
             let id = placement
-                .place(&mut write, &self.planner, &mut room, now_ms, &mut notifications)
+                .place(&mut write, &self.planner, &mut budget, now_ms, &mut notifications)
                 .await?;
             rollback.deployments.push(id);
         }

@@ -62,7 +62,8 @@ enum Command {
     )]
     Paper(PaperFlags),
 
-    /// The load of a fleet on one server: all robots connect at once, then one deployment goes to all
+    /// The load of a fleet on one server: all robots connect at once, then one deployment goes to
+    /// all
     ///
     /// Robots are the agent's own driver, link, fetch and verification, all in one process; they
     /// build and start nothing. The exit code is 0 if nothing failed.
@@ -74,8 +75,8 @@ enum Command {
     ///
     /// Starts Postgres, the servers, HAProxy where it is installed, and robots that log every
     /// acknowledged report. After each run the database is compared with the logs. The exit code is
-    /// 0 if no invariant was broken and nothing else failed. Needs PostgreSQL; as root or where user
-    /// namespaces are allowed.
+    /// 0 if no invariant was broken and nothing else failed. Needs PostgreSQL; as root or where
+    /// user namespaces are allowed.
     #[command(after_help = "Examples:\n  taskbench cluster --robots 300 --faults F0,F1,F9\n  \
                       taskbench cluster --robots 10000 --seconds 120 --repetitions 5 --cost \\\n    \
                       --faults F0,F1,F2,F3,F4,F6,F7,F8,F9,F10")]
@@ -127,8 +128,8 @@ enum Command {
 
     /// Look at the page in a browser while a fleet reports, and scroll
     ///
-    /// Needs node, Chromium and the packages of `scripts/need page`. First rows are timed from asking
-    /// for the page, with a session; main-thread times are the browser's own trace.
+    /// Needs node, Chromium and the packages of `scripts/need page`. First rows are timed from
+    /// asking for the page, with a session; main-thread times are the browser's own trace.
     #[command(
         after_help = "Example:\n  taskbench page --robots 10000 --rate 1000 --browser \"$(scripts/need page)\""
     )]

@@ -10,7 +10,7 @@ use clap::Args;
 use task_proto::api::{CreateDeployment, DeliveryChoice, DeploymentState, DeploymentView};
 use task_proto::ids::selector::Selector;
 
-use super::reporters::{Reporter, connect, report_at};
+use super::reporters::{Reporter, connect, report_at, stored_times};
 use crate::programs::database::{add_robots, sqlite_url};
 use crate::programs::taskd::{Taskd, TaskdArgs, TaskdFlags};
 use crate::results::run::{Point, Run, RunFlags, Unit};
@@ -47,7 +47,7 @@ pub struct OrdersFlags {
     run: RunFlags,
 }
 
-/// What is ordered of the robots.
+/// An order to the robots.
 enum Ordered {
     /// A new package. It is cancelled as soon as this part of the robots have their assignments.
     Package { selector: &'static str, cancelled_at: Option<f64> },
@@ -225,13 +225,7 @@ fn part_placed(view: &DeploymentView) -> f64 {
 }
 
 fn record_reports(point: &mut Point, outcomes: Vec<anyhow::Result<Vec<f64>>>) {
-    let mut stored = Vec::new();
-    for outcome in outcomes {
-        match outcome {
-            Ok(samples) => stored.extend(samples),
-            Err(error) => point.fail(format!("{error:#}")),
-        }
-    }
+    let stored = stored_times(outcomes, point);
     let longest = stored.iter().copied().fold(0.0, f64::max);
     point.measure("longest_stop_of_reports", Unit::Milliseconds, [longest]);
     point.measure("stored_after", Unit::Milliseconds, stored);

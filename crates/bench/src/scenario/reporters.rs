@@ -17,6 +17,7 @@ use crate::measure::mqtt::{Link, Login, Packet, message};
 use crate::programs::enrollment::enroll_robots;
 use crate::programs::server::Server;
 use crate::programs::taskd::Taskd;
+use crate::results::run::Point;
 
 /// Connections opened at a time.
 const CONCURRENT_CONNECTS: usize = 64;
@@ -126,6 +127,18 @@ pub async fn report_at(
         robot.keep_reporting(due)
     });
     Ok((begin, futures_util::future::join_all(reporting).await))
+}
+
+/// The times of all robots' reports, in milliseconds. A robot that failed is a failure of `point`.
+pub fn stored_times(outcomes: Vec<anyhow::Result<Vec<f64>>>, point: &mut Point) -> Vec<f64> {
+    let mut stored = Vec::new();
+    for outcome in outcomes {
+        match outcome {
+            Ok(times) => stored.extend(times),
+            Err(error) => point.fail(format!("{error:#}")),
+        }
+    }
+    stored
 }
 
 impl Reporter {

@@ -10,7 +10,7 @@ use std::time::Instant;
 use anyhow::Context as _;
 use clap::Args;
 
-use super::reporters::{Reporter, connect, report_at};
+use super::reporters::{Reporter, connect, report_at, stored_times};
 use crate::programs::taskd::{Taskd, TaskdArgs, TaskdFlags};
 use crate::results::run::{Point, Run, RunFlags, Unit};
 use crate::system::machine::allow_files;
@@ -91,13 +91,7 @@ async fn measure(
     let cpu_s = taskd.usage().cpu_s - before.cpu_s;
     let wall = begin.elapsed();
     syncs.extend(sync_ms(taskd.dir())?);
-    let mut stored = Vec::new();
-    for outcome in outcomes {
-        match outcome {
-            Ok(samples) => stored.extend(samples),
-            Err(error) => point.fail(format!("{error:#}")),
-        }
-    }
+    let stored = stored_times(outcomes, point);
     point.measure("stored_per_s", Unit::PerSecond, [stored.len() as f64 / wall.as_secs_f64()]);
     point.measure(
         "server_cpu_us_per_report",

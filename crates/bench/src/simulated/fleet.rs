@@ -70,7 +70,7 @@ pub struct FleetArgs<'a> {
     pub own_addresses: bool,
     /// The program that starts the robots' processes, if they need a namespace.
     pub outer: Option<Program>,
-    /// Whether robots log what they do, instead of sending events.
+    /// Whether robots write a log, instead of sending events.
     pub logged: bool,
 }
 

@@ -1,5 +1,5 @@
-//! What a connected robot and a report cost with a number of servers: reports at a fixed rate over
-//! plain connections straight to the servers, and nothing else.
+//! The cost of a connected robot and of a report for a number of servers: reports at a fixed rate
+//! over plain connections straight to the servers, and nothing else.
 
 use std::net::SocketAddr;
 use std::time::Duration;
@@ -10,7 +10,7 @@ use super::database::Database;
 use super::engines::{EngineArgs, Engines};
 use super::figures::Resources;
 use crate::results::run::{Point, Unit};
-use crate::scenario::reporters::{connect_to, report_at};
+use crate::scenario::reporters::{connect_to, report_at, stored_times};
 
 /// Time for the servers to come to rest after the connections.
 const REST: Duration = Duration::from_secs(3);
@@ -42,13 +42,7 @@ pub async fn measure(args: &CostArgs<'_>) -> anyhow::Result<Point> {
     point.measure("resident_per_robot", Unit::Bytes, [grown / args.robots as f64]);
     let (_, outcomes) = report_at(&mut robots, args.rate, args.seconds).await?;
     let to = Resources::now(&engines, database.counters().await?, 0);
-    let mut stored = Vec::new();
-    for outcome in outcomes {
-        match outcome {
-            Ok(times) => stored.extend(times),
-            Err(error) => point.fail(format!("{error:#}")),
-        }
-    }
+    let stored = stored_times(outcomes, &mut point);
     let reports = stored.len() as f64;
     point.measure("stored", Unit::Milliseconds, stored);
     let (used, per) = (to.minus(&from), |value: f64| [value / reports]);

@@ -1,5 +1,5 @@
-//! What the run reads from the servers' database, and the few things it does there: it looks at
-//! locks, ends sessions and promotes the standby. It never writes to a table.
+//! The run's own statements on the servers' database: it reads rows and locks, ends sessions and
+//! promotes the standby. It never writes to a table.
 #![expect(clippy::disallowed_methods, reason = "the run compares the database with the robots")]
 
 use std::collections::BTreeMap;

@@ -1,5 +1,5 @@
-//! The figures of a run: how soon orders arrive and reports are stored, before, during and after the
-//! fault, how soon robots are back, and what that costs. It never judges a figure.
+//! The figures of a run: how soon orders arrive and reports are stored, before, during and after
+//! the fault, how soon robots are back, and the resources for that. It never judges a figure.
 
 use std::time::Duration;
 
@@ -38,7 +38,7 @@ impl Resources {
         }
     }
 
-    /// What was used since `from`.
+    /// The use of resources since `from`.
     pub fn minus(&self, from: &Self) -> Used {
         let cpu_s = |of: &Self| of.nodes.iter().map(|usage| usage.cpu_s).sum::<f64>();
         let (counters, before) = (self.counters, from.counters);
@@ -58,7 +58,7 @@ impl Resources {
     }
 }
 
-/// What the engines used between two moments.
+/// The engines' use of resources between two moments.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Used {
     pub seconds: f64,
@@ -168,7 +168,7 @@ pub fn measure_pause(point: &mut Point, logs: &RobotLogs, began_ns: u64, ended_n
     point.measure("longest_pause", Unit::Milliseconds, longest);
 }
 
-/// Adds what the engines used between two moments.
+/// Adds the engines' use of resources between two moments.
 pub fn measure_resources(point: &mut Point, logs: &RobotLogs, from: &Resources, to: &Resources) {
     let used = to.minus(from);
     let within = from.at_ns..=to.at_ns;

@@ -1,5 +1,5 @@
-//! What must hold after every run, whatever failed meanwhile: comparisons of the database with the
-//! robots' own logs and with the load's record. Each returns what it found wrong.
+//! The invariants of every run, with any fault: comparisons of the database with the robots' own
+//! logs and with the load's record. Each returns its violations.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -12,7 +12,7 @@ use super::load::RolloutSample;
 use super::robot_logs::{Acknowledged, RobotLogs};
 use crate::simulated::fleet::name;
 
-/// Phases that orders set, whatever the robot has reported.
+/// Phases that orders set, independent of the robot's reports.
 const SET_BY_ORDERS: [&str; 3] = ["superseded", "cancelled", "expired"];
 
 /// The database at the end of a run.
@@ -41,7 +41,8 @@ pub fn lost_reports(logs: &RobotLogs, stored: &Stored) -> Vec<String> {
     found
 }
 
-/// I1 at a failover: the standby had all reports that were acknowledged before the primary was lost.
+/// I1 at a failover: the standby had all reports that were acknowledged before the primary was
+/// lost.
 pub fn lost_at_failover(
     logs: &RobotLogs,
     lost_ns: u64,
@@ -109,10 +110,10 @@ pub fn repeated_runs(logs: &RobotLogs) -> Vec<String> {
 
 /// I4: a rollout never had more than its batch busy, nor more failures than its limit.
 pub fn exceeded_limits(samples: &[RolloutSample]) -> Vec<String> {
-    let most = |of: fn(&RolloutSample) -> u64, limit: fn(&RolloutSample) -> u64, what: &str| {
+    let most = |of: fn(&RolloutSample) -> u64, limit: fn(&RolloutSample) -> u64, state: &str| {
         let beyond = samples.iter().filter(|sample| of(sample) > limit(sample));
         let worst = beyond.max_by_key(|sample| of(sample))?;
-        Some(format!("{} robots of a rollout {what}, allowed are {}", of(worst), limit(worst)))
+        Some(format!("{} robots of a rollout {state}, allowed are {}", of(worst), limit(worst)))
     };
     let busy = most(|sample| sample.progress.busy, |sample| sample.batch, "were busy");
     let failed = most(|sample| sample.progress.failed, |sample| sample.max_failures, "failed");
@@ -214,13 +215,9 @@ mod tests {
     use crate::scenario::cluster::robot_logs::StoredReport;
     use crate::simulated::robots::log::LoggedTask;
 
-    fn deployment() -> DeploymentId {
-        "d-0123456789abcdef0123456789abcdef".parse().unwrap_or_else(|_| DeploymentId::random())
-    }
-
     /// A robot that has reported `running` at (1, 4) and generation 3, as the database has it.
     fn agreeing() -> (RobotLogs, Stored) {
-        let deployment = deployment();
+        let deployment = DeploymentId::random();
         let task = LoggedTask {
             task: "job".parse().expect("a name"),
             deployment: deployment.clone(),

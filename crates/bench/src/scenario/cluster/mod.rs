@@ -1,5 +1,6 @@
-//! `taskbench cluster`: several servers on one Postgres behind HAProxy, robots that log what they do,
-//! a load of all kinds, and faults. Invariants are checked after each run; a broken one is a failure.
+//! `taskbench cluster`: several servers on one Postgres behind HAProxy, robots with logs of their
+//! own, a load of all kinds, and faults. Invariants are checked after each run; a broken one is a
+//! failure.
 
 mod cost;
 mod database;
@@ -62,7 +63,7 @@ pub struct ClusterFlags {
     /// Packages are kept by two versitygw; without it, in a shared directory
     #[arg(long, value_name = "PATH")]
     versitygw: Option<PathBuf>,
-    /// Also measure what a report and a connection cost with one server, two, and so on
+    /// Also measure the cost of a report and a connection with one server, two, and so on
     #[arg(long)]
     cost: bool,
     /// Reports per second for --cost
@@ -113,7 +114,7 @@ pub async fn run(flags: ClusterFlags) -> anyhow::Result<Run> {
     let costs = if flags.cost { usize::from(flags.nodes) } else { 0 };
     let repetitions = usize::from(flags.repetitions);
     let mut progress = RunProgress::new(flags.faults.len() * repetitions + costs);
-    // Rounds, so that what changes on the machine meanwhile concerns all faults.
+    // Rounds, so that changes on the machine meanwhile concern all faults.
     for round in 0..repetitions {
         for (number, fault) in flags.faults.iter().enumerate() {
             progress.set_message(fault.label());
@@ -146,7 +147,7 @@ pub async fn run(flags: ClusterFlags) -> anyhow::Result<Run> {
                 print_line(&format!("{}, seed {seed}: {count} × {why}", fault.label()));
             }
             run.points.push(point);
-            // What a longer campaign has so far outlives its end.
+            // A campaign that is cut short keeps its results.
             run.write(&flags.run.out, begun).context("the results can't be written")?;
             progress.step();
         }

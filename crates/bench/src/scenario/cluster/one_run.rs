@@ -45,7 +45,7 @@ pub struct RunArgs<'a> {
     pub length: Duration,
 }
 
-/// What a run leaves for the comparison.
+/// The record of a run, for the comparison.
 struct Evidence {
     record: Record,
     double: std::collections::BTreeSet<String>,
@@ -75,7 +75,7 @@ pub async fn run_once(args: &RunArgs<'_>) -> anyhow::Result<(Point, String)> {
     let evidence = put_under_load(args, &mut engines, &mut database).await?;
     let settled = settle(&mut database, &fleet).await;
     settled.err().into_iter().for_each(|error| point.fail(format!("{error:#}")));
-    // The logs first: what they have acknowledged must be in the database.
+    // The logs first: each report that they have as acknowledged must be in the database.
     let logs = RobotLogs::read(fleet.logs())?;
     let times = evidence.fault.times;
     measure_latencies(&mut point, &logs, &evidence.record, times);
@@ -200,15 +200,21 @@ async fn check(
         }
     }
     // A check of nothing proves nothing.
-    let acknowledged = [logs.acknowledged as f64];
-    point.measure("acknowledged_reports", Unit::Number, acknowledged);
-    point.measure("orders_repeated", Unit::Number, [record.repeated.len() as f64]);
-    point.measure("rollout_samples", Unit::Number, [record.samples.len() as f64]);
-    point.measure("runs_started", Unit::Number, [logs.started.len() as f64]);
-    point.measure("objects_needed", Unit::Number, [needed.len() as f64]);
-    point.measure("feed_entries", Unit::Number, [feed.len() as f64]);
-    let heard: usize = record.feeds.iter().map(Vec::len).sum();
-    point.measure("feed_entries_heard", Unit::Number, [heard as f64]);
+    let compared = [
+        ("acknowledged_reports", logs.acknowledged as usize),
+        ("orders_repeated", record.repeated.len()),
+        ("rollout_samples", record.samples.len()),
+        ("runs_started", logs.started.len()),
+        ("objects_needed", needed.len()),
+        ("feed_entries", feed.len()),
+        ("feed_entries_heard", record.feeds.iter().map(Vec::len).sum()),
+    ];
+    for (quantity, count) in compared {
+        point.measure(quantity, Unit::Number, [count as f64]);
+        if count == 0 {
+            point.fail(format!("{quantity}: there are none to check"));
+        }
+    }
     for why in &record.failures {
         point.fail(format!("load: {why}"));
     }

@@ -34,7 +34,7 @@ pub struct Gap {
     pub until_ns: Option<u64>,
 }
 
-/// What all robots have logged.
+/// The logs of all robots.
 #[derive(Debug, Default)]
 pub struct RobotLogs {
     /// By the robot's number.

@@ -1,5 +1,5 @@
 //! The log of a process's robots: a line for each session, desired state, start of a task and
-//! acknowledged report, as the robot saw them. What the servers stored is compared with it.
+//! acknowledged report, as the robot saw them. The database is compared with this log.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{BufWriter, Write as _};

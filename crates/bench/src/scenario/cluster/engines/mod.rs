@@ -1,5 +1,5 @@
-//! Owns the engines of a run: the servers under measurement, their database, their store of packages
-//! and the balancers in front; it never measures.
+//! Owns the engines of a run: the servers under measurement, their database, their store of
+//! packages and the balancers in front; it never measures.
 
 mod addresses;
 mod balancer;
@@ -29,12 +29,12 @@ use crate::system::process::Program;
 const BALANCERS: usize = 3;
 /// As the agent's own default.
 const POLL: std::time::Duration = std::time::Duration::from_secs(300);
-/// After this time the collector takes what no package needs, also while packages are pushed.
+/// After this time the collector deletes unneeded blobs, also while packages are pushed.
 const BLOB_GRACE: &str = "20s";
 /// Limits that a fleet at one address would meet, unlike a real one.
 const NO_LIMIT: &str = "1000000";
 
-/// What the engines of a run have to be able to do.
+/// The engines that a run needs.
 #[derive(Debug, Clone)]
 pub struct EngineArgs<'a> {
     pub taskd: &'a TaskdFlags,
@@ -149,7 +149,7 @@ impl Engines {
 
     fn node(&self, args: &EngineArgs<'_>, number: usize, ports: &[u16]) -> Node {
         let name = format!("node-{}", number + 1);
-        // The name tells whose session of the database holds a lock.
+        // The name shows the server of a database session that holds a lock.
         let url = |port: &u16| format!("{}?application_name={name}", Postgres::url_at(*port));
         let database: Vec<String> = ports.iter().map(url).collect();
         let address = self.addresses.node(number);

@@ -91,8 +91,8 @@ mod tests {
             let (mut from, mut to) = peer.split();
             let _ = tokio::io::copy(&mut from, &mut to).await;
         });
-        let nobody = SocketAddr::from((Ipv4Addr::LOCALHOST, 1));
-        let relay = Relay::start(vec![nobody, target]).await.expect("listens");
+        let closed = SocketAddr::from((Ipv4Addr::LOCALHOST, 1));
+        let relay = Relay::start(vec![closed, target]).await.expect("listens");
         let mut client =
             TcpStream::connect((Ipv4Addr::LOCALHOST, relay.port)).await.expect("connects");
         let mut byte = [0];

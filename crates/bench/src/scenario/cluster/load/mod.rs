@@ -1,5 +1,6 @@
-//! Owns the load of a run: orders, a rollout, pushes and deletions of packages, readers of events and
-//! questions to robots, each at a random server, all at the same time; it never judges an answer.
+//! Owns the load of a run: orders, a rollout, pushes and deletions of packages, readers of events
+//! and questions to robots, each at a random server, all at the same time; it never judges an
+//! answer.
 
 mod orders;
 mod pusher;
@@ -11,7 +12,7 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use anyhow::{Context as _, bail};
+use anyhow::Context as _;
 use rand::SeedableRng as _;
 use rand::rngs::SmallRng;
 use task_proto::{DeploymentId, TaskName, Version};
@@ -33,7 +34,7 @@ const AGAIN: Duration = Duration::from_millis(200);
 /// Time limit for requests under way when the load ends.
 const END_TIMEOUT: Duration = Duration::from_secs(120);
 
-/// What the load is made of.
+/// The sizes of the load.
 #[derive(Debug, Clone)]
 pub struct LoadArgs {
     /// Robots of the fleet.
@@ -74,7 +75,7 @@ pub struct OrderRecord {
     pub robots: Vec<usize>,
 }
 
-/// What all parts of the load use.
+/// The servers and the record, for all parts of the load.
 #[derive(Clone)]
 struct Client {
     servers: Arc<[Arc<Server>]>,
@@ -110,7 +111,7 @@ impl Load {
         Self { client, tasks }
     }
 
-    /// Ends the load, and waits for what is under way.
+    /// Ends the load, and waits for requests under way.
     pub async fn end(mut self) -> anyhow::Result<Record> {
         self.client.stop.cancel();
         let ending = async {
@@ -161,10 +162,10 @@ impl Client {
         for number in (0..self.servers.len()).cycle().skip(first % self.servers.len()) {
             match tokio::time::timeout(TRY_TIMEOUT, ask(self.servers[number].clone())).await {
                 Ok(Ok(answer)) => return Ok((number, answer)),
-                Ok(Err(ServerError::Refused(what, status, reason)))
+                Ok(Err(error @ ServerError::Refused(_, status, _)))
                     if status.is_client_error() && status.as_u16() != 429 =>
                 {
-                    bail!("{what} was refused with {status}: {reason}");
+                    return Err(error.into());
                 }
                 Ok(Err(error)) => last = error.into(),
                 Err(_) => last = anyhow::anyhow!("no answer within {TRY_TIMEOUT:?}"),

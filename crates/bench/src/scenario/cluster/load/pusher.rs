@@ -9,13 +9,13 @@ use rand::RngExt as _;
 
 use super::{Client, name_and_version, ticks};
 use crate::programs::package::Package;
-use crate::programs::server::Server;
+use crate::programs::server::{Server, ServerError};
 
 const INTERVAL: Duration = Duration::from_millis(250);
 const PAYLOAD_BYTES: u64 = 16 * 1024;
 /// Versions that are not deleted yet.
 const KEPT: usize = 3;
-/// Contents that are pushed in turns, so that a push finds what a deletion has just released.
+/// Contents that are pushed in turns, so that a push finds blobs that a deletion has just released.
 const CONTENTS: u64 = 5;
 
 pub(super) async fn run(client: Client) -> anyhow::Result<()> {
@@ -39,11 +39,16 @@ pub(super) async fn run(client: Client) -> anyhow::Result<()> {
             let delete =
                 |server: Arc<Server>| async move { server.remove_package(task, manifest).await };
             match client.ask_until_answered(first, delete).await {
-                Err(error) if format!("{error:#}").contains("404") => {}
+                Err(error) if is_not_found(&error) => {}
                 deleted => drop(deleted?),
             }
             client.record().deleted += 1;
         }
     }
     Ok(())
+}
+
+fn is_not_found(error: &anyhow::Error) -> bool {
+    let refused = error.downcast_ref::<ServerError>();
+    matches!(refused, Some(ServerError::Refused(_, status, _)) if status.as_u16() == 404)
 }

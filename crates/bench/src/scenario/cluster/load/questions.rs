@@ -1,4 +1,4 @@
-//! An operator who asks a random robot at a random server for its vitals. Robots that move and
+//! Questions for the vitals of a random robot at a random server. Robots that move and
 //! servers that are away leave questions unanswered.
 
 use std::time::{Duration, Instant};

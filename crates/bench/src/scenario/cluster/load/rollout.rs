@@ -32,7 +32,7 @@ pub struct RolloutSample {
     pub max_failures: u64,
 }
 
-/// Robots of a batch, for a fleet of so many.
+/// The robots of a batch in a fleet of this size.
 fn batch(robots: usize) -> u64 {
     robots.div_ceil(BATCHES).max(robots.div_ceil(FEW_BATCHES).min(LARGE_BATCH)) as u64
 }

@@ -252,7 +252,8 @@ fn start_mqtt(
 }
 
 /// Prevents a second agent from using the data directory while this one lives. Only this user may
-/// access the file: a user who could open it could lock it, and so prevent each agent from starting.
+/// access the file: a user who could open it could lock it, and so prevent each agent from
+/// starting.
 fn lock(data: &Layout) -> anyhow::Result<File> {
     let path = data.root().join("lock");
     let open = || {

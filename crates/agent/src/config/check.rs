@@ -13,8 +13,8 @@ use super::{Config, ConfigError, Settings, deserialize};
 /// Tables whose keys are checked together, because they depend on each other.
 const JOINT_TABLES: [&str; 2] = ["gate", "trusted_publishers"];
 
-/// The errors for which the agent would refuse the file at `path` with these variables: those of all
-/// keys, else the first one that the agent would report.
+/// The errors for which the agent would refuse the file at `path` with these variables: those of
+/// all keys, else the first one that the agent would report.
 pub fn check_file(
     path: &Path,
     variables: impl Iterator<Item = (OsString, OsString)>,

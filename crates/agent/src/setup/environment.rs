@@ -47,8 +47,8 @@ pub const ROS_VARIABLES: [&str; 20] = [
     "ROS_HOSTNAME",
 ];
 
-/// The variables of `run_env` that decide which ROS graph the task's nodes join. The agent must know
-/// them to find the nodes.
+/// The variables of `run_env` that decide which ROS graph the task's nodes join. The agent must
+/// know them to find the nodes.
 pub fn graph_variables(
     run_env: &BTreeMap<String, String>,
 ) -> impl Iterator<Item = (String, String)> {
@@ -57,8 +57,8 @@ pub fn graph_variables(
     pairs.map(|(name, value)| (name.clone(), value.clone()))
 }
 
-/// The variables that name the robot. A server of an earlier version does not send the robot's name;
-/// its id stands in.
+/// The variables that name the robot. A server of an earlier version does not send the robot's
+/// name; its id stands in.
 pub fn robot_variables(id: &RobotId, robot: &RobotDescription) -> BTreeMap<String, String> {
     let mut variables = BTreeMap::new();
     // Of several keys with the same variable, the first in the order of their bytes counts.

@@ -1,7 +1,7 @@
 //! The generated scripts: `run.sh`, which starts the task, `build.sh`, which builds it, and the
 //! probe's script, which queries the contents of an underlay. Pure text. A value from a manifest
-//! only ever appears in single quotes, never as shell; the names of variables in `run.env` were checked
-//! with the manifest.
+//! only ever appears in single quotes, never as shell; the names of variables in `run.env` were
+//! checked with the manifest.
 //!
 //! A task runs in its version's `work` directory, which [`crate::install::work_dir`] fills with
 //! links. So `exec = ["install/talker/lib/talker/talker"]` works for a built task, and

@@ -81,7 +81,7 @@ async fn running_task_survives_its_agent() {
     assert!(std::path::Path::new(&format!("/proc/{pid}")).exists());
 }
 
-/// The robots are only rows, so many that the order takes longer than its answer.
+/// The robots are only rows, enough that the order takes longer than its answer.
 #[tokio::test(flavor = "multi_thread")]
 async fn large_order_goes_on_after_a_server_crash() {
     const ROBOTS: u64 = 20_000;

@@ -1,5 +1,5 @@
-//! Owns texts that people read or write: times, sizes, messages of parsers, keys of files, lines of logs; it never
-//! handles a message of the protocol.
+//! Owns texts that people read or write: times, sizes, messages of parsers, keys of files, lines of
+//! logs; it never handles a message of the protocol.
 
 pub mod error_chain;
 pub mod expected;

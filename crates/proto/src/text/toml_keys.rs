@@ -36,7 +36,7 @@ pub struct KeyReference<'a> {
     pub variable: Option<&'a str>,
     /// The default as it is written in the file, or in words; empty: the setting is off or absent.
     pub default: &'a str,
-    /// What the key sets.
+    /// The meaning of the key.
     pub meaning: &'a str,
 }
 

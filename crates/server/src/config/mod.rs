@@ -99,7 +99,8 @@ pub struct Config {
     pub trusted_proxies: Vec<IpAddr>,
     /// The addresses of balancers that begin each connection with a PROXY protocol header.
     pub proxies: Vec<IpAddr>,
-    /// Time from a stop signal to the stop, for a balancer and for robots to move to another server.
+    /// Time from a stop signal to the stop, for a balancer and for robots to move to another
+    /// server.
     pub drain: Duration,
     /// This server's place in a cluster; absent: it is the only server on its database.
     pub cluster: Option<ClusterSettings>,
@@ -602,7 +603,8 @@ fn read_file(path: &Path) -> Result<(String, toml::Table), ConfigError> {
     Ok((text, table))
 }
 
-/// A suggestion for a mistyped key: the closest setting, else the one that shares its first letters.
+/// A suggestion for a mistyped key: the closest setting, else the one that shares its first
+/// letters.
 fn suggestion(key: &str) -> String {
     let keys: Vec<String> = SETTINGS.iter().map(Setting::key).collect();
     if let Some(best) = closest_key(key, keys.iter().map(String::as_str)) {

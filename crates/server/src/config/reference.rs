@@ -1,5 +1,5 @@
-//! The reference of all keys of the server's configuration file, from the table that the server reads
-//! its settings by. Never reads a file.
+//! The reference of all keys of the server's configuration file, from the table that the server
+//! reads its settings by. Never reads a file.
 
 use task_proto::toml_keys::{KeyReference, reference_table};
 

@@ -1,7 +1,7 @@
 //! The tables of the configuration file: `[blobs]`, `[cluster]`, `[delivery]` with the operator's
 //! rules, `[transfers]` with the limits of each site, `[robots]` and `[people]` with rate limits,
-//! `[oidc]`, `[tls]`. A key with a single value is an ordinary setting; the rest is read here. Every
-//! error names its key.
+//! `[oidc]`, `[tls]`. A key with a single value is an ordinary setting; the rest is read here.
+//! Every error names its key.
 
 use std::collections::BTreeMap;
 use std::path::Path;

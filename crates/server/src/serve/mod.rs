@@ -271,7 +271,8 @@ impl Server {
         self.tls.as_ref().map_or(Ok(()), Tls::reload)
     }
 
-    /// Waits until the broker or the database has failed for good, or another server has taken over.
+    /// Waits until the broker or the database has failed for good, or another server has taken
+    /// over.
     pub async fn failure(&self) -> Failure {
         let (mut health, mut unusable) = (self.broker.health(), self.unusable.clone());
         let broker = async {
@@ -294,8 +295,8 @@ impl Server {
         }
     }
 
-    /// Prepares the stop for the setting's time: `/readyz` answers 503 from now on, and after half of
-    /// the time, in which a balancer notices, the robots' sessions end one after the other.
+    /// Prepares the stop for the setting's time: `/readyz` answers 503 from now on, and after half
+    /// of the time, in which a balancer notices, the robots' sessions end one after the other.
     pub async fn drain(&self) {
         self.drain.before_stop().await;
     }

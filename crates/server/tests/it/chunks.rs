@@ -97,7 +97,7 @@ async fn order_in_three_chunks_reaches_all_robots(database: TestDatabase) {
     assert_eq!(view.state, DeploymentState::Settled);
     let robots_in = |view: task_proto::api::DeploymentView| view.assignments.expect("there").len();
     assert_eq!(robots_in(view), 5);
-    // The audit says what was meant, once.
+    // The audit has the whole order, once.
     let query = AuditQuery { act: Some("deployment.create".to_owned()), ..Default::default() };
     let page = fleet.database.store.audit().page(&query).await.expect("reads");
     let [record] = page.records.as_slice() else { panic!("{page:?}") };

@@ -117,7 +117,7 @@ fn parse(text: &str, fleet: &[Stored]) -> Selector {
     text.parse().expect("a selector")
 }
 
-/// What the wire types' own matcher says of those robots of the fleet that meet a condition.
+/// The robots of the fleet that meet both conditions, sorted by name.
 fn expected(
     fleet: &[Stored],
     is_among: impl Fn(&Stored) -> bool,

@@ -30,8 +30,8 @@ impl Robot {
         environment
     }
 
-    /// The environment of a build or run of `package` as `user` with the home directory `home`. Also
-    /// makes the task's directories reachable for `user`.
+    /// The environment of a build or run of `package` as `user` with the home directory `home`.
+    /// Also makes the task's directories reachable for `user`.
     pub(super) fn environment_of(
         &self,
         package: &PackageRef,

@@ -1,5 +1,6 @@
-//! The command line of `taskd` as a whole: `serve` beside the operator's commands, the checks of the
-//! server that they need, and the commands about the database and the blobs of a stopped server.
+//! The command line of `taskd` as a whole: `serve` beside the operator's commands, the checks of
+//! the server that they need, and the commands about the database and the blobs of a stopped
+//! server.
 
 mod blobs;
 mod config;

@@ -1,5 +1,5 @@
-//! Owns the way to the database: connections, their faults, migrations, checks, copies, and the lock
-//! that admits one server; it never knows what the tables of the fleet mean.
+//! Owns the way to the database: connections, their faults, migrations, checks, copies, and the
+//! lock that admits one server; it never knows what the tables of the fleet mean.
 
 pub(super) mod connections;
 pub(super) mod copy;

@@ -1,6 +1,6 @@
 //! Translates selectors and scopes to SQL for sets of robots' ids, of which the database makes
-//! unions, differences and intersections. This module runs no statement. What it means is what
-//! [`Selector::matches`] and [`Scope::covers`] say, and a test compares the two.
+//! unions, differences and intersections. This module runs no statement. The sets are those of
+//! [`Selector::matches`] and [`Scope::covers`]; a test compares the two.
 
 use serde::Serialize;
 use sqlx::any::AnyArguments;

@@ -88,7 +88,7 @@ impl OrderChunks<&mut Transaction> {
         Ok(())
     }
 
-    /// Removes what is left of an order, which is never placed. Returns whether anything was left.
+    /// Removes the unplaced rest of an order. Returns whether there was a rest.
     pub async fn remove_all(&mut self, deployment: &DeploymentId) -> Result<bool, StoreError> {
         let removed = sqlx::query("DELETE FROM order_chunks WHERE deployment_id = $1")
             .bind(deployment.as_str())
